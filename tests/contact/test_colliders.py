@@ -260,8 +260,7 @@ def test_points_rest_on_a_shape_from_outside(name, device):
     height = np.sqrt(0.05**2 - off**2)
     points = np.stack([(0.15 + off) * np.cos(angle), height + 0.8 * R, (0.15 + off) * np.sin(angle)], axis=1)
     pins, torus = wc.Pins(np.arange(12), axes="xz"), Torus(radius=0.15, tube=0.05)
-    scene = beads(points, 1e6, pins=pins, colliders=[torus], fps=60.0, duration=1.0)
-    upwards = height / 0.05
+    scene, upwards = beads(points, 1e6, pins=pins, colliders=[torus], fps=60.0, duration=1.0), height / 0.05
     gaps = R - 1e-3 * 9.81 / (1e6 * scene.contact_terms[0].areas * upwards)
     found = wc.simulate(scene, SOLVERS[name], dtype="float64", device=device).points[-1, :, 1]
     np.testing.assert_allclose((found - height) * upwards, gaps, atol=R / 500)
@@ -381,8 +380,7 @@ def test_resets_into_colliders_are_refused(threads, device):
     """By vertex, copy and collider; of copies that are reset only, and pins may start anywhere."""
     scene = falling([wc.Plane(name="floor"), wc.Sphere(radius=0.1, position=(0.0, 1.0, 0.0), name="ball")], pins=[2])
     model = scene.build(copies=3, device=device, threads=threads if device == "cpu" else 1)
-    stepper = wc.Newton(substeps=2).bind(model)
-    start = np.tile(scene.positions, (3, 1, 1))
+    stepper, start = wc.Newton(substeps=2).bind(model), np.tile(scene.positions, (3, 1, 1))
     start[:, 2, 1] = -0.5
     start[1, 4], start[2, 5, 1] = [0.0, 1.0, 0.0], -0.25
     before = stepper.state.x.numpy().copy()
@@ -431,8 +429,7 @@ def test_an_equilibrium_in_a_groove():
     points = np.array([[-2, 2, -2], [-2, 2, 2], [0, 0, -2], [0, 0, 2], [2, 2, -2], [2, 2, 2]])
     groove = wc.MeshCollider(points * [0.25, 0.1, 0.25] + [0.25, -0.15, 0.25], [[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
     rest = wc.equilibrium(falling([groove], n=5, height=0.08), record="reactions")
-    assert rest.status.result is Result.CONVERGED and rest.stable
-    assert groove.distances(rest.points).min() > 0.5 * R
+    assert rest.status.result is Result.CONVERGED and rest.stable and groove.distances(rest.points).min() > 0.5 * R
     (force,) = rest.collider_forces.values()
     np.testing.assert_allclose(force, [0.0, -9.81 * 0.15 * 0.5**2, 0.0], atol=1e-7)
 

@@ -120,8 +120,7 @@ def test_a_sheet_sticks_to_a_slope(name, law, tangent, mesh, device):
     animation = run(scene, name, 60 if name == "explicit" else 2, device, mesh)
     along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
     held, swings = ((0.3e-4 + EXTRA) / SOFTNESS, 1e-4) if law is Sticky else (0.3e-4, 0.3e-4)
-    assert abs(along[-1] - along[30]) < (swings if name == "explicit" else 1e-9)
-    assert 0.0 < along[-1] < 20.0 * held
+    assert abs(along[-1] - along[30]) < (swings if name == "explicit" else 1e-9) and 0.0 < along[-1] < 20.0 * held
 
 
 @each_solver
@@ -227,14 +226,11 @@ def test_a_belt_slides_over_a_polygon(device, friction=0.3):
     solver = wc.Newton(substeps=2, tolerance=1e-5, linear="factorised")
     points = wc.simulate(capstan, solver, dtype="float64", device=device).points[16:]
     edges = np.diff(points[:, : points.shape[1] // 2], axis=1)
-    turns = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1)
-    middle = edges.shape[1] // 2
+    turns, middle = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1), edges.shape[1] // 2
     inner = slice(middle - 3, middle + 3)  # vertex i + 1 is between the edges i and i + 1
-    half = friction * np.tan(0.5 * turns[:, inner])
-    found = tensions(capstan, points)
+    half, found = friction * np.tan(0.5 * turns[:, inner]), tensions(capstan, points)
     ratio = found[:, inner.stop] / found[:, inner.start] / np.prod((1.0 + half) / (1.0 - half), axis=1)
-    assert (turns[:, inner] > 0.99 * np.pi / 8).all()
-    assert np.mean(ratio) == pytest.approx(1.0, abs=1e-4)
+    assert (turns[:, inner] > 0.99 * np.pi / 8).all() and np.mean(ratio) == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("softer", (1.0, 20.0))
@@ -247,8 +243,7 @@ def test_a_belt_presses_on_a_drum(softer, device):
     edge = np.linalg.norm(points[0] - points[1])
     inner = points[:, 2] < -0.05
     turn = 2.0 * np.arcsin(0.5 * edge / np.linalg.norm(points[inner][:, [0, 2]], axis=1))
-    radius = 0.5 * edge / np.sin(0.5 * turn)
-    gaps = capstan.colliders[0].distances(points[inner])
+    radius, gaps = 0.5 * edge / np.sin(0.5 * turn), capstan.colliders[0].distances(points[inner])
     k, r, pressure = contact.stiffness, contact.distance, 20.0 / radius
     expected = r - pressure / k if softer == 1.0 else k * r**2 / (4.0 * pressure)
     np.testing.assert_allclose(r - gaps if softer == 1.0 else gaps, r - expected if softer == 1.0 else expected, rtol=0.01)
@@ -382,8 +377,7 @@ def test_a_ring_bears_its_load(name, device):
     solver, load, fields, errors = RINGS[name]
     declared = ring.scene(load, **fields)
     found, high = borne(declared, wc.simulate(declared, solver, dtype="float64", device=device).points[-1])
-    assert found == pytest.approx(load, rel=errors[0])
-    assert high == pytest.approx(ring.height(load), rel=errors[1])
+    assert found == pytest.approx(load, rel=errors[0]) and high == pytest.approx(ring.height(load), rel=errors[1])
 
 
 def test_the_answers_of_a_ring():

@@ -48,8 +48,7 @@ def contacts_at(pairs, x):
     pairs.forces.launch(pairs.model.array(x, pairs.model.vec3))
     found, forces, n = pairs.contact, pairs.contact.forces, pairs.contact.data.normal.numpy().copy()
     keys = found.pairs.keys.numpy()[: found.pairs.number.numpy()[0]]
-    pull = (forces.force.numpy() * n).sum(axis=1)
-    share = np.maximum(found.data.share.numpy(), 1e-300)
+    pull, share = (forces.force.numpy() * n).sum(axis=1), np.maximum(found.data.share.numpy(), 1e-300)
     along = np.einsum("ei,eij,ej->e", n, forces.definite.numpy(), n)
     bend = np.where(found.data.stiffness.numpy() > 0.0, along / share, 0.0)
     values = pull, bend, n, found.data.weights.numpy(), found.pairs.stencils.numpy()
@@ -92,8 +91,7 @@ def test_the_matrix_is_the_derivative_of_the_forces(gap, turn, move, device):
     # Below r/4 = 1.25 mm edges act too, without a turn nearly parallel ones. With fixed weights and normals nothing resists
     # sliding.
     scene, rng, eta = layers(turn=turn, gap=gap), np.random.default_rng(1), 1e-5 * gap
-    x = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape)
-    pairs = pairs_of(scene, device)
+    x, pairs = scene.positions + 0.1 * gap * rng.normal(size=scene.positions.shape), pairs_of(scene, device)
     begin(pairs, x)
     p = rng.normal(size=x.shape) if move == "any" else np.arange(len(x))[:, None] // 36 * [1.0, 0.0, 0.3]
     expected, (found, hessian) = slope_of(gradient, pairs, x, p, eta), hessian_times(pairs, x, p)
@@ -169,8 +167,7 @@ def test_a_stack_rests(dtype, mesh, device):
     tolerance = 1e-6 if dtype == "float64" else 5e-3
     assert pushes[1:].sum(axis=1) == pytest.approx(np.full(12, DENSITY * GRAVITY), rel=tolerance)
     assert np.diff(at).min() < 0.45 * r and np.diff(at).max() > 0.5 * r
-    assert np.ptp(high, axis=1).max() < tolerance * r
-    assert rest.energies["self-contact"] > 0.0
+    assert np.ptp(high, axis=1).max() < tolerance * r and rest.energies["self-contact"] > 0.0
     assert rest.collider_forces["floor"][1] == pytest.approx(-GRAVITY * stack.vertex_masses.sum(), rel=tolerance)
 
 
@@ -220,8 +217,7 @@ def test_pins_that_cloth_holds_back(device):
     keyframes = np.tile(two.positions, (2, 1, 1))
     keyframes[1, :16, 1] += 0.1
     rest = wc.equilibrium(replace(two, pins=wc.Pins(np.arange(32), keyframes)), iterations=20, device=device)
-    assert rest.status.result is Result.ITERATIONS_USED_UP and not rest.stable
-    assert rest.points[:16, 1].max() < 0.02
+    assert rest.status.result is Result.ITERATIONS_USED_UP and not rest.stable and rest.points[:16, 1].max() < 0.02
 
 
 def borders(n):
@@ -240,8 +236,7 @@ def test_pins_that_pinned_cloth_holds_back(name, rise, device):
     solver = wc.Newton(substeps=2, integrator="midpoint") if name == "midpoint" else SOLVERS[name]
     stepper = after_frames(replace(two, pins=wc.Pins(held, keyframes)), solver, device=device, dtype="float64")
     for x in positions(stepper, 6):
-        assert np.linalg.norm(stepper.state.v.numpy(), axis=1).max() < 1.0
-        assert crossed(x, two.mesh.triangles) == 0
+        assert np.linalg.norm(stepper.state.v.numpy(), axis=1).max() < 1.0 and crossed(x, two.mesh.triangles) == 0
     assert stepper.pairs.pins_held[0].farthest == pytest.approx(rise - 0.0075, abs=0.0026)
 
 
@@ -383,8 +378,7 @@ def test_a_copy_that_moves_again_moves_no_other(device, r=5e-3):
     mesh = wc.MeshCollider(0.1 * solid.vertices, solid.faces, position=np.arange(5)[:, None] * [0, 2e-3, 0] + [3, 0, 0])
     ball, contact = wc.Sphere(radius=0.1, position=[0.0, -0.12, 0.0]), wc.Contact(distance=r, stiffness=10.0)
     fields = {"fps": 60.0, "duration": 4 / 60, "colliders": [ball, mesh], "contact": contact}
-    scene = layers(gap=0.06 * r, distance=r, stiffness=1e-2, **fields)
-    velocities = np.zeros((2, 72, 3))
+    scene, velocities = layers(gap=0.06 * r, distance=r, stiffness=1e-2, **fields), np.zeros((2, 72, 3))
     velocities[1, :, 1] = -15.0
 
     def ends(velocities):
@@ -408,8 +402,7 @@ def test_contact_in_a_frame_that_moves(name, device):
         fields = {"velocities": np.tile([0.0, -0.3 * (not moves), 0.0], (32, 1)), "colliders": [plane], "contact": contact}
         scene = layers(gap=8e-3, n=4, turn=17.0, duration=0.125, **fields)
         ends.append(after_frames(scene, solver, 3, device=device, dtype="float64").state.x.numpy() - rise[-1])
-    assert np.ptp(ends[0][:, 1]) > 1e-3
-    assert ends[1] == pytest.approx(ends[0], abs=1e-9)
+    assert np.ptp(ends[0][:, 1]) > 1e-3 and ends[1] == pytest.approx(ends[0], abs=1e-9)
 
 
 @few_solvers
@@ -429,8 +422,7 @@ def test_what_colliders_close_on(name, device):
 def test_starts_pressed_together(name, gap, device):
     """Sheets within the contact distance fly apart with the energy of contact at the start, which is no divergence."""
     animation = wc.simulate(layers(n=3, gap=gap, duration=0.125), SOLVERS[name], device=device)
-    assert "diverged" not in animation.status.message
-    assert np.ptp(animation.points[-1, :, 1]) > 5e-3
+    assert "diverged" not in animation.status.message and np.ptp(animation.points[-1, :, 1]) > 5e-3
 
 
 def diagonals():
@@ -478,8 +470,7 @@ def test_free_fall_of_a_stack(solver, device, fps=48):
     scene = cloth(mesh, velocities=velocities, terms=[wc.Spring(stiffness=100.0)], **fields)
     run = wc.simulate(scene, solver, device=device, dtype="float64", frames=8)
     fall = 3.0 * 8 / fps + GRAVITY / fps**2 * 8 * 9 / 2  # implicit Euler
-    assert run.cut == 0.0
-    assert run.points[0, :75, 1] - run.points[-1, :75, 1] == pytest.approx(fall, abs=1e-6)
+    assert run.cut == 0.0 and run.points[0, :75, 1] - run.points[-1, :75, 1] == pytest.approx(fall, abs=1e-6)
 
 
 @table("substeps", [200], [100, 200])
@@ -488,8 +479,7 @@ def test_energy_is_conserved(substeps, device):
     scene = layers(n=3, gap=2.5e-3, duration=1 / 24)
     energies = wc.simulate(scene, wc.Explicit(substeps=substeps), device=device, dtype="float64", record="energies").energies
     total, of_contact = sum(energies.values()), energies["self-contact"]
-    assert of_contact[0] == pytest.approx(0.5 * 1e5 * 0.25 * 2.5e-3**2)
-    assert of_contact[-1] < of_contact[0]
+    assert of_contact[0] == pytest.approx(0.5 * 1e5 * 0.25 * 2.5e-3**2) and of_contact[-1] < of_contact[0]
     assert total[-1] == pytest.approx(total[0], rel=0.05 * (100 / substeps) ** 2)
 
 
@@ -568,8 +558,7 @@ def test_forces_do_not_depend_on_the_age_of_a_list(ratio, device):
             begin(pairs, points)
             assert (pairs.proximity.found.numpy() == points).all() == anew
             forces.append(gradient(pairs, points))
-        assert np.abs(forces[-1]).max() > 0.0
-        assert (forces[-1] == forces[-2]).all()
+        assert np.abs(forces[-1]).max() > 0.0 and (forces[-1] == forces[-2]).all()
 
 
 @table(
@@ -601,8 +590,7 @@ def test_steps_with_nothing_near_are_those_with_contact(name, speed, device, mon
                 stepper.step()
             stepper.frame()
         ends.append(stepper.state.copy())
-    assert ends[0] == ends[1]
-    assert (stepper.pairs.lists.numpy() > (1 if speed > 1.0 else 0)).all()
+    assert ends[0] == ends[1] and (stepper.pairs.lists.numpy() > (1 if speed > 1.0 else 0)).all()
     assert stepper.pairs.steps.numpy().tolist() == [6 * stepper.steps_per_frame] * 2
 
 
@@ -830,8 +818,7 @@ def test_crossings():
 
 def test_an_edge_in_line_with_a_triangle_does_not_cross_it():
     """Of a straight row of triangles, in which rounding decides on which side of another an edge begins and ends."""
-    random = np.random.default_rng(0)
-    row = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0]])
+    random, row = np.random.default_rng(0), np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0], [3, 0, 0]])
     turns = np.linalg.qr(random.normal(size=(1000, 3, 3)))[0]
     points = (row @ turns + random.normal(size=(1000, 1, 3))).reshape(-1, 3)
     first = 5 * np.arange(1000)[:, None]

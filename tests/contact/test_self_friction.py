@@ -93,8 +93,7 @@ def test_forces_are_the_gradient_and_their_slope_the_hessian(size, device):
     x = scene.positions + size * rng.normal(size=scene.positions.shape) * [1.0, 0.0, 1.0]
     force = gradient(pairs, x, pairs.friction)
     total = np.abs(force).sum()
-    assert total > 1e-3
-    assert np.abs(force.sum(axis=0)).max() < 1e-13 * total
+    assert total > 1e-3 and np.abs(force.sum(axis=0)).max() < 1e-13 * total
     hessian = Hessian(pairs.model, terms=[], dynamic=pairs.forces.terms)
     hessian.assemble(pairs.model.array(x, pairs.model.vec3), 0.0)
     H, friction = (hessian.matrix() + hessian.coupling()).toarray(), pairs.friction.matrix().toarray()
@@ -167,13 +166,11 @@ def test_energy_becomes_heat(name, device):
     scene = slope(0.6, duration=0.25)
     mass = scene.vertex_masses[4:, None]
     run = wc.simulate(scene, SOLVERS[name], device=device, dtype="float64", record="energies")
-    recorded = run.energies.pop("heat of friction")
-    total = sum(run.energies.values())
+    recorded, total = run.energies.pop("heat of friction"), sum(run.energies.values())
     way = (mass * (run.points - run.points[0])[:, 4:])[:, :, 0].sum(axis=1) / mass.sum()
     heat = 0.3 * mass.sum() * GRAVITY * np.cos(np.arctan(0.6)) * way
     assert recorded[0] == 0.0 and (np.diff(recorded) > 0.0).all()
-    assert recorded[-1] == pytest.approx(heat[-1], rel=0.03)
-    assert (np.diff(total) < 0.0).all()
+    assert recorded[-1] == pytest.approx(heat[-1], rel=0.03) and (np.diff(total) < 0.0).all()
     assert total[0] - total[-1] == pytest.approx(heat[-1], rel=0.03)
     if name == "explicit":
         assert total[0] - total[-1] == pytest.approx(recorded[-1], rel=0.003)
@@ -192,8 +189,7 @@ def test_turns_with_the_cloth(axis, device):
             pairs.friction.launch_end(pairs.model.array(x, pairs.model.vec3))
         begin(pairs, x)
         found.append(gradient(pairs, x, pairs.friction))
-    assert np.abs(found[0]).max() > 1e-3
-    assert found[1] == pytest.approx(turn.apply(found[0]), abs=1e-12)
+    assert np.abs(found[0]).max() > 1e-3 and found[1] == pytest.approx(turn.apply(found[0]), abs=1e-12)
 
 
 @pytest.mark.host

@@ -103,8 +103,7 @@ def test_a_tip_stays_below_a_triangle(device):
     stepper = after_frames(scene, wc.Newton(substeps=2), dtype="float64", device=device)
     for a, b, c in positions(stepper, 4):
         normal = np.cross(b - a, c - a)
-        assert abs(normal @ a) / np.linalg.norm(normal) < 0.05
-        assert normal @ -a * np.sign(normal[1]) < 0.0
+        assert abs(normal @ a) / np.linalg.norm(normal) < 0.05 and normal @ -a * np.sign(normal[1]) < 0.0
 
 
 def test_pins_may_be_inside_a_mesh():
@@ -201,8 +200,7 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
     scene = sheet([ground(0.2, 14), ground(0.4, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
     model, skin = scene.build(copies=2, dtype="float64", device=device), 0.01
     surface = ContactSurface(model, itself)
-    x = surface.of_model(surface.rest)
-    rng = np.random.default_rng(0)
+    x, rng = surface.of_model(surface.rest), np.random.default_rng(0)
     x[: model.count] += rng.normal(scale=0.02, size=(model.count, 3))
     found = Proximity(surface, R, skin, R)
     stencils = np.concatenate(detect(found, x))
@@ -232,8 +230,7 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
         found = rng.normal(size=(count, 3))
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
-    assert len(near(x, skin)) > 1000
-    assert sorted(listed) == sorted(near(x, skin))
+    assert len(near(x, skin)) > 1000 and sorted(listed) == sorted(near(x, skin))
     x += rng.uniform(-2.0, 2.0, 3)
     x[model.count :] += 0.02 * skin * ways(len(x) - model.count)
     x[: model.count] += (found.kept - 0.12) * skin * ways(model.count)
@@ -264,8 +261,7 @@ def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
     fields = {"colliders": colliders, "contact": wc.Contact(distance=4e-3, stiffness=1e4), "fps": 24.0}
     scene = cloth(grid, terms=[wc.Spring(stiffness=300.0)], positions=start, **fields)
     falls = np.array([[0.0, -3.0, 0.0], [1.0, -8.0, 0.0]])[:, None]
-    velocities = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls
-    found = []
+    velocities, found = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls, []
     for copies in (1, 2):
         stepper = after_frames(scene, solver, copies=copies, dtype="float64", device=device)
         stepper.reset(None, None, velocities[:copies])
@@ -283,8 +279,7 @@ def test_a_copy_that_stays_apart_does_not_walk_with_another(device):
     mesh = wc.Mesh(np.concatenate([points, other]) + 100.0 * np.array([1, 1, -1]), [*grid.triangles, *(grid.triangles + 64)])
     terms, contact = [wc.Spring(stiffness=200.0)], wc.SelfContact(distance=6e-3)
     scene = wc.Scene(mesh, density=0.15, terms=terms, fps=24.0, gravity=(0, 0, 0), self_contact=contact)
-    velocities = np.repeat([[0.0, 1.0, 0.0], [0.4, -1.0, 0.0]], 64, axis=0)
-    found = []
+    velocities, found = np.repeat([[0.0, 1.0, 0.0], [0.4, -1.0, 0.0]], 64, axis=0), []
     for speeds in ([0.7], [0.7, 1.0]):
         stepper = wc.XPBD(substeps=2).bind(scene.build(copies=len(speeds), device=device))
         stepper.reset(None, None, np.array(speeds)[:, None, None] * velocities)

@@ -14,7 +14,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
 from support.setups import SOLVERS, allocated, square
 from support.sheets import SPRINGS, declared
 from support.steps import after_frames
@@ -42,7 +42,7 @@ def same(steppers):
     return all(np.array_equal(a, b) for other in others for a, b in zip(expected, other, strict=True))
 
 
-@pytest.mark.parametrize("name", slow_but(("xpbd",), SOLVERS))
+@table("name", ("xpbd",), SOLVERS)
 def test_copies_shared_out_are_those_of_one_thread(name, device):
     """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
     record = replace(SOLVERS[name], substeps=2)
@@ -193,16 +193,14 @@ def test_debug_mode_has_one_thread(device, monkeypatch):
 
 
 def test_simulate_and_bench_take_threads(device, capsys, monkeypatch):
-    scene = square(pins="corners", fps=300.0)
-    record = wc.XPBD(substeps=2, iterations=3)
+    scene, record = square(pins="corners", fps=300.0), wc.XPBD(substeps=2, iterations=3)
     one, two = (wc.simulate(scene, record, device=device, frames=3, copies=2, threads=threads) for threads in (1, 2))
     assert np.array_equal(one.points, two.points)
     command = ["bench", "hanging", "-p", "n=5", "--solver", "explicit", "--frames", "2", "--json", "--threads", "2"]
     monkeypatch.setattr(benchmarks, "_alone", lambda asked: asked.run())  # in this process, which has the kernels
     assert main([*command, "--copies", "2"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["rows"]
-    assert row["threads"] == 2 and row["launches"] > 1.0
-    assert main(command) == 2
+    assert row["threads"] == 2 and row["launches"] > 1.0 and main(command) == 2
     assert "threads is 2 with one copy; it must be 1" in capsys.readouterr().err
 
 

@@ -226,8 +226,7 @@ def test_moves_turn_first_and_shift_then(folder, tmp_path, capfd):
     np.testing.assert_allclose(points[:, held], mesh.points[None, held].repeat(97, 0), atol=EPS)
     assert facts["handles"] == len(end) + len(middle) + len(held) and facts["vertices"] == len(mesh.points)
     assert facts["file"] == str(output) and facts["frames"] == 96 and facts["most_iterations"] >= facts["median_iterations"] > 0
-    assert 0.0 <= facts["largest_angle"] <= 180.0 and facts["last_energy"] > 0.0
-    assert validate(output) == []
+    assert 0.0 <= facts["largest_angle"] <= 180.0 and facts["last_energy"] > 0.0 and validate(output) == []
 
 
 def test_a_stage_is_deformed_by_a_layer_over_it(tmp_path, capfd):

@@ -20,8 +20,7 @@ def bent(frames=4):
     """The sheet, bent about z to cylinders of growing curvature, which is isometric, and moved, (frames, n, 3)."""
     found = []
     for k in range(frames):
-        angle = 0.4 * (k + 1) * (TEMPLATE.points[:, 0] - 0.5)
-        radius = 1.0 / (0.4 * (k + 1))
+        angle, radius = 0.4 * (k + 1) * (TEMPLATE.points[:, 0] - 0.5), 1.0 / (0.4 * (k + 1))
         y = radius * (1.0 - np.cos(angle))
         found.append(np.stack([0.5 + radius * np.sin(angle) + 0.03 * k, y, TEMPLATE.points[:, 2]], axis=1))
     return np.array(found)
@@ -88,12 +87,10 @@ def test_folds_are_not_cut(frames, whole):
 
 def test_what_holes_hide_is_not_observed():
     """Vertices over a hole in the middle follow their neighbours, and are said not to be observed."""
-    true = bent(1)
-    middle = (np.abs(TEMPLATE.points - 0.5)[:, [0, 2]] < 0.2).all(axis=1)
+    true, middle = bent(1), (np.abs(TEMPLATE.points - 0.5)[:, [0, 2]] < 0.2).all(axis=1)
     kept = ~middle[TEMPLATE.triangles].any(axis=1)
     seen = wc.as_capture([Surface(true[0], TEMPLATE.triangles[kept])], dt=1.0)
-    found = wc.resample(seen, TEMPLATE)
-    inside = np.setdiff1d(np.arange(len(true[0])), TEMPLATE.boundary)
+    found, inside = wc.resample(seen, TEMPLATE), np.setdiff1d(np.arange(len(true[0])), TEMPLATE.boundary)
     assert found.distances[0][middle].min() < 0.13  # points within 0.141 m count
     assert not found.observed[0][middle].any() and found.observed[0][inside].mean() > 0.5
     assert np.abs(found.points[0] - true[0])[middle].max() < 5e-3

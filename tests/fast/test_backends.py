@@ -120,7 +120,7 @@ def draped(moving):
     return wc.Scene(mesh, density=0.15, terms=[replace(SPRINGS, damping=0.01)], **fields)
 
 
-@pytest.mark.parametrize("moving", slow_but([True], [False, True]))
+@table("moving", [True], [False, True])
 @pytest.mark.parametrize("backend", slow_but(["gather"], ["blocks", "gather"]), indirect=True)
 def test_contact_in_explicit_steps_is_that_of_the_core(moving, backend, device):
     """Anchors of friction and cuts too; also where positions are set in between. To follow contact changes no bit, and
@@ -195,7 +195,7 @@ GRADIENTS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in ("nothing", "springs")], GRADIENTS))
+@table("name, dtype", [(name, "float32") for name in ("nothing", "springs")], GRADIENTS)
 def test_gradients_are_those_of_the_core(name, dtype, device):
     """At x, and at x + d."""
     model = declared(TERMS[name]).build(device=device, dtype=dtype)
@@ -216,7 +216,7 @@ def test_a_backend_that_is_not_there_is_refused():
         record(declared([]), "cpu", "fastest")
 
 
-@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
+@table("dtype", ["float32"], ["float32", "float64"])
 @pytest.mark.parametrize("backend", ["core", "blocks", "gather"], indirect=True)
 def test_a_soft_crease_joins_stiff_parts(backend, dtype, device):
     """What is left out of a matrix is not what is small beside all else at its vertices: the torque that unfolds is there."""
@@ -242,10 +242,7 @@ def test_a_soft_crease_joins_stiff_parts(backend, dtype, device):
 PAIRS = ("nothing", "springs", BACKWARDS, "damped springs")
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    slow_but([(name, "float32") for name in PAIRS], [*((name, "float32") for name in PAIRS), ("springs", "float64")]),
-)
+@table("name, dtype", [(name, "float32") for name in PAIRS], [*((name, "float32") for name in PAIRS), ("springs", "float64")])
 def test_steps_of_one_launch_are_steps(name, dtype, device, monkeypatch):
     """Of CUDA, but right on the CPU too: an even number and an odd one, of the CPU to the bit those of a launch each."""
     monkeypatch.setattr(gather_layout, "LANED", 0)  # as of many copies
@@ -285,7 +282,7 @@ def test_which_copies_are_blocks(scene, one, device, monkeypatch):
 LAUNCHED = [name for name, made in SOLVERS.items() if isinstance(made, (wc.Explicit, wc.PBD, wc.HierarchicalPBD, wc.XPBD))]
 
 
-@pytest.mark.parametrize("launches", slow_but([10], [1, 10, 10_000]))
+@table("launches", [10], [1, 10, 10_000])
 @pytest.mark.parametrize("name", [*LAUNCHED, "xpbd midpoint", "newton"])
 def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
     """In graphs of one step, of some with some over, and of all; with pins that move, a counter of their own, and damping."""
@@ -300,8 +297,7 @@ def test_frames_are_steps_to_the_bit(name, launches, device, monkeypatch):
             steppers[1].step()
     for one, other in zip(*(stepper.state for stepper in steppers), strict=True):
         assert np.array_equal(one.numpy(), other.numpy())
-    assert np.array_equal(steppers[0].residual, steppers[1].residual)
-    assert steppers[0].results == steppers[1].results
+    assert np.array_equal(steppers[0].residual, steppers[1].residual) and steppers[0].results == steppers[1].results
 
 
 SWEEPS = {
@@ -368,8 +364,7 @@ def test_blocks_have_every_element_once(copies, device, monkeypatch):
     model = scene.build(device=device, copies=copies)
     vertices, terms, found, numbers = layout_of(model.terms, model.per_copy, copies)
     assert vertices[0] == 0 and vertices[-1] == model.count and (np.diff(vertices) > 0).all()
-    assert np.isin(np.arange(copies) * N, vertices).all()
-    assert numbers <= 60
+    assert np.isin(np.arange(copies) * N, vertices).all() and numbers <= 60
     runs = 0
     for before, after, arrays in zip(model.terms, terms, found, strict=True):
         stencil = after.stencil.numpy()

@@ -72,8 +72,7 @@ def test_a_copy_does_not_depend_on_others(small, device):
         solver, x = CopyCycles(model, constant_matrices(model, 100.0)), model.vectors()
         solver.solve(model.array(np.tile(b, (model.copies, 1)), model.vec3), x)
         alone.append((solver.cycles, x.numpy()))
-    assert alone[0][0] != alone[1][0]
-    assert (alone[3][1] == np.concatenate([x for _, x in alone[:3]])).all()
+    assert alone[0][0] != alone[1][0] and (alone[3][1] == np.concatenate([x for _, x in alone[:3]])).all()
     assert len(solver._matrix.values) == 2
 
 
@@ -112,8 +111,7 @@ def test_iterations_end_where_those_with_factors_do(module, solver, small, devic
     monkeypatch.setattr(module, "solve_copies", CopyCycles)
     found, stepper = after_steps(swinging(8), solver, device)
     assert stepper.results == factorised.results == [Result.CONVERGED]
-    assert stepper.iterations < 1.2 * factorised.iterations
-    assert np.abs(found - expected).max() < 1e-7
+    assert stepper.iterations < 1.2 * factorised.iterations and np.abs(found - expected).max() < 1e-7
 
 
 @pytest.mark.parametrize("dense", [12, 300])

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
 from support.steps import after_steps
 from warpcloth.numerics.hierarchy import levels
 from warpcloth.numerics.unfolding import UnfoldedSurface
@@ -126,10 +126,7 @@ def test_levels_of_any_mesh(name):
         there = kept
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    slow_but([(name, "float32") for name in SCENES], [*((name, "float32") for name in SCENES), ("grid", "float64")]),
-)
+@table("name, dtype", [(name, "float32") for name in SCENES], [*((name, "float32") for name in SCENES), ("grid", "float64")])
 def test_steps_on_any_mesh_and_copies(name, dtype, device):
     """Of a cloth stretched by a tenth: finite, no more stretched after; pins stay, and copies have the bits of one alone."""
     scene = replace(SCENES[name], positions=1.1 * SCENES[name].mesh.points, gravity=(0.0, 0.0, 0.0))
@@ -200,8 +197,7 @@ def test_bent_sheets_meet_the_bounds_of_the_flat_one():
     mesh = wc.Mesh.grid(6, 41, pattern="alternating")
     across, along = (mesh.points / np.ptp(mesh.points, axis=0).clip(1e-9)).T[::2]
     r, turn = 0.4 + 0.6 * across, 0.98 * np.pi * (2.0 * along - 1.0)
-    flat = wc.Mesh(np.stack([r * np.sin(turn), 0.0 * r, r * np.cos(turn)], axis=1), mesh.triangles)
-    tip = 0.75
+    flat, tip = wc.Mesh(np.stack([r * np.sin(turn), 0.0 * r, r * np.cos(turn)], axis=1), mesh.triangles), 0.75
     cone = np.stack([tip * r * np.sin(turn / tip), np.sqrt(1.0 - tip**2) * r, tip * r * np.cos(turn / tip)], axis=1)
     x, y, z = flat.points.T
     rolled = np.stack([0.2 * np.sin(x / 0.2), y - 0.2 * np.cos(x / 0.2), z], axis=1)

@@ -26,8 +26,7 @@ def sagging(stiffness, apart):
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     points = np.concatenate([grid.points, np.add(corner, [3.0, 0.0, 0.0]), np.add(corner, [6.0, 0.0, 0.0])])
-    mesh = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]]))
-    start = points.copy()
+    mesh, start = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]])), points.copy()
     start[:25, 1] = 1e-3 * np.random.default_rng(0).normal(size=25)
     start[28, 0] -= apart
     terms = [wc.QuadraticBending(stiffness=1e-3), wc.Spring(pairs=[[25, 26], [28, 29]], stiffness=[stiffness, 1e4])]
@@ -276,6 +275,5 @@ def test_the_negative_part_is_reduced_as_far_as_needed_and_restored_by_quarters(
             given = [negative, policy, outdated, wanted, unsolved]
             wp.launch(kernels.find_indefinite(), 3, inputs=given, device=device)
         assert outdated.numpy().tolist() == [1, 0, 1]
-    assert found[0] == [1.0] + 4 * [0.75, 0.5]
-    assert found[1] == [1.0] * 4
+    assert found[0] == [1.0] + 4 * [0.75, 0.5] and found[1] == [1.0] * 4
     assert found[2] == [1.0, 0.75, 0.5] + 4 * [0.25, 0.0]

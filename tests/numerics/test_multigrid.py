@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 import warpcloth as wc
 from support.continuum import flat, hill, jittered
 from support.matrices import block_matrix
-from support.rows import slow_but
+from support.rows import table
 from support.scenes import scene
 from support.steps import after_frames
 from warpcloth.core.hessian import Hessian
@@ -197,16 +197,13 @@ def test_iterations_hardly_depend_on_resolution(device, stiffness, most):
     """With diagonal blocks they grow as the number of vertices per side until inertia limits them."""
     fine = {used: iterations(48, stiffness, device, used) for used in (True, False)}
     coarse = {used: iterations(16, stiffness, device, used) for used in (True, False)}
-    assert fine[True] <= most
-    assert fine[True] <= 1.5 * coarse[True] + 2
-    assert fine[False] >= 1.8 * coarse[False]
-    assert fine[True] <= fine[False] / 5
+    assert fine[True] <= most and fine[True] <= 1.5 * coarse[True] + 2
+    assert fine[False] >= 1.8 * coarse[False] and fine[True] <= fine[False] / 5
 
 
 def locked():
     """``hanging`` with a line of vertices that slide along the vertical."""
-    declared = scene("hanging", n=15)
-    axes = np.ones((225, 3), dtype=bool)
+    declared, axes = scene("hanging", n=15), np.ones((225, 3), dtype=bool)
     axes[105:120, [0, 2]] = False
     return replace(declared, free_axes=axes)
 
@@ -220,7 +217,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(["hanging", "locked", "copies"], SCENES))
+@table("name", ["hanging", "locked", "copies"], SCENES)
 def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name):
     """After three frames, to the tolerance of Newton's iteration."""
     declared, build = SCENES[name]
@@ -291,8 +288,7 @@ def test_diagonal_blocks_stop_where_multigrid_costs_less(device):
 
     assert iterations(16, 1e5, device, False) > 60
     solver = weighed(16, 1e5, device, make)
-    assert int(solver.iteration.numpy()[0]) == 45
-    assert solver.choice.kept["preconditioner"].numpy()[0, 0] == 0
+    assert int(solver.iteration.numpy()[0]) == 45 and solver.choice.kept["preconditioner"].numpy()[0, 0] == 0
 
 
 def test_a_negative_curvature_changes_no_choice(device):

@@ -88,8 +88,7 @@ def test_hard_rows_that_are_redundant(device):
 
 def test_steps_of_large_meshes_end_where_those_of_rows_do(device, monkeypatch):
     """Two frames of ``hanging`` with 15² vertices; a run by conjugate gradients over rows ends there too."""
-    declared = scene("hanging", n=15)
-    found = []
+    declared, found = scene("hanging", n=15), []
     for least in (constrained_dynamics.MIN_VERTICES, 10**9):
         monkeypatch.setattr(constrained_dynamics, "MIN_VERTICES", least)
         stepper = wc.ConstrainedDynamics(substeps=2, tolerance=1e-9, iterations=100).bind(

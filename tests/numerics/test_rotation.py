@@ -31,19 +31,16 @@ def precision(request):
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_3x3(name, precision, device):
-    A = samples(name, np.random.default_rng(3), COUNT, precision)
-    bound = BOUND[precision]
+    A, bound = samples(name, np.random.default_rng(3), COUNT, precision), BOUND[precision]
     R, signed = reference(A)
     largest = np.where(signed[:, 0] > 0, signed[:, 0], 1)
     gap = np.maximum(signed[:, 1] + signed[:, 2], 0.0) / largest
 
     U, S, V = numpy(wc.svd(on(device, A), convention="rotation"))
-    assert reconstruction(A, times(U, S), V.mT) <= bound
-    assert max(orthogonality(U), orthogonality(V)) <= bound
+    assert reconstruction(A, times(U, S), V.mT) <= bound and max(orthogonality(U), orthogonality(V)) <= bound
     assert max(determinant(U, 1), determinant(V, 1)) <= bound
     assert (S[:, 0] >= S[:, 1]).all() and (S[:, 1] >= np.abs(S[:, 2])).all()
-    assert (np.abs(S - signed) / largest[:, None]).max() <= bound
-    assert (angle(U @ V.mT, R) * gap).max() <= bound
+    assert (np.abs(S - signed) / largest[:, None]).max() <= bound and (angle(U @ V.mT, R) * gap).max() <= bound
 
     plain_U, plain_S, plain_V = numpy(wc.svd(on(device, A)))
     assert np.array_equal(plain_S, np.abs(S)) and np.array_equal(plain_V, V)
@@ -59,8 +56,7 @@ def test_3x3(name, precision, device):
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_3x2_and_2x2(name, precision, device):
-    whole = samples(name, np.random.default_rng(4), COUNT // 10, precision)
-    bound = BOUND[precision]
+    whole, bound = samples(name, np.random.default_rng(4), COUNT // 10, precision), BOUND[precision]
     for A in (np.ascontiguousarray(whole[:, :, :2]), np.ascontiguousarray(whole[:, :2, :2])):
         square = A.shape[1] == 2
         expected = np.linalg.svd(A.astype(np.float64), compute_uv=False)
@@ -149,8 +145,7 @@ def test_polar_decomposition_does_not_overflow(dtype, device):
 @PRECISIONS
 def test_the_ends_of_the_range(dtype, device):
     """Numbers so small that they have few digits, or so large that their squares overflow: no more is lost."""
-    limits = np.finfo(dtype)
-    rng = np.random.default_rng(9)
+    limits, rng = np.finfo(dtype), np.random.default_rng(9)
     for scale in (limits.smallest_subnormal * 1e3, limits.tiny, limits.max / 4):
         for shape in ((3, 3), (3, 2), (2, 2)):
             A = (rng.uniform(-1, 1, size=(1000, *shape)) * dtype(scale)).astype(dtype)
@@ -216,9 +211,7 @@ def points(rng, count, shape=(), dtype=np.float64):
 def test_kabsch_finds_the_rotation(precision, device):
     """Of point sets that were turned and moved, weighted or not, also 1000 sizes from the origin."""
     rng = np.random.default_rng(11)
-    turns = matrices.rotations(rng, 200)
-    P = points(rng, 12).astype(precision)
-    weights = rng.uniform(size=12)
+    turns, P, weights = matrices.rotations(rng, 200), points(rng, 12).astype(precision), rng.uniform(size=12)
     for far, eps in ((0.0, 1.0), (1e3, 1e3)):
         X = (P + far).astype(precision)
         Q = ((X.astype(np.float64) - far) @ turns.mT - far).astype(precision)
@@ -255,8 +248,7 @@ def test_kabsch_where_the_rotation_is_not_unique(device):
     t, (v, u) = np.linspace(-1, 1, 5)[:, None], rng.normal(size=(2, 3))
     v, u = v / np.linalg.norm(v), u / np.linalg.norm(u)
     assert np.abs(wc.kabsch(t * v, t * u) - least_rotations(v[None], u[None])[0]).max() < 1e-14
-    flat = P * [1.0, 1.0, 0.0]
-    turn = matrices.rotations(rng, 1)[0]
+    flat, turn = P * [1.0, 1.0, 0.0], matrices.rotations(rng, 1)[0]
     assert np.abs(wc.kabsch(flat, flat @ turn.T) - turn).max() < 1e-14
     assert determinant(wc.kabsch(P, P * [1.0, 1.0, -1.0])[None], 1) < 1e-14
     for bad in (np.nan, np.inf):  # a set of one point says nothing of its rotation, but must not hide it
@@ -274,10 +266,8 @@ def test_kabsch_where_the_rotation_is_not_unique(device):
 def test_kabsch_does_without_points_of_weight_0_and_without_a_scale(precision, device):
     """Points without weight, the first among them, may be anywhere; small or large values are not squared."""
     rng = np.random.default_rng(15)
-    turn = matrices.rotations(rng, 1)
-    P = points(rng, 6).astype(precision)
-    bound = 40.0 * np.finfo(precision).eps
-    far = np.concatenate([[[1e8, 1e8, -1e8]], P]).astype(precision)
+    turn, P = matrices.rotations(rng, 1), points(rng, 6).astype(precision)
+    bound, far = 40.0 * np.finfo(precision).eps, np.concatenate([[[1e8, 1e8, -1e8]], P]).astype(precision)
     Q = np.concatenate([[[0.0, 0.0, 0.0]], P.astype(np.float64) @ turn[0].T]).astype(precision)
     assert angle(wc.kabsch(far, Q, weights=[0, 1, 1, 1, 1, 1, 1])[None], turn)[0] < bound
     for scale in (1e-22, 1e-30, 1e20, 1e30) if precision is np.float32 else (1e-170, 1e-250, 1e160, 1e250):

@@ -107,8 +107,7 @@ def test_frames_steps_resets_and_states_give_the_same_bits():
     for frame in range(14):
         frames.frame()
         lengths.append(frames.steps_per_frame)
-        assert sum(1 for _ in steps.steps_of_frame()) == lengths[-1]
-        assert frames.state == steps.state
+        assert sum(1 for _ in steps.steps_of_frame()) == lengths[-1] and frames.state == steps.state
         if frame == 6:
             again.state.from_host(frames.state.to_host())
         elif frame > 6:

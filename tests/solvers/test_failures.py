@@ -19,7 +19,7 @@ import warpcloth as wc
 from support.energies import EQUILATERAL, bending_density, energies_of_elements, energy_and_gradient
 from support.meshes import kite, rolled
 from support.nets import NETS, jacobian, net
-from support.rows import slow_but
+from support.rows import slow_but, table
 from support.scenes import scene
 from support.setups import SOLVERS as STEPPING
 from support.steps import METHODS, after_frames, after_steps, hanging_mass, newton_step, objective, spring, strains, swinging
@@ -58,7 +58,7 @@ def strayed(declared, h, steps, device):
     return np.abs(x - declared.positions).max()
 
 
-@pytest.mark.parametrize("kind", slow_but(list(NETS)[:1], NETS))
+@table("kind", list(NETS)[:1], NETS)
 def test_01_explicit_holds_below_and_diverges_above_its_limit(kind, device):
     """At 0.99 of 2/ω_max 1e4 steps of small oscillation hold, at 1.01 they diverge (Provot 1995)."""
     declared = net(kind, positions=net(kind).mesh.points + 1e-8 * np.random.default_rng(0).normal(size=(1600, 3)))
@@ -78,8 +78,7 @@ def test_01_the_limit_at_rest_is_none_in_motion_but_gershgorins_is(device):
     start = 20.0 * points + 1e-8 * np.random.default_rng(0).normal(size=points.shape) * inside[:, None]
     declared = net("structural", n=n, positions=start, pins=np.flatnonzero(~inside))
     rest, motion = step_limits(declared.build(device=device, dtype="float64"))
-    assert motion < rest
-    assert strayed(declared, 0.99 * motion, 2000, device) < 1e-5
+    assert motion < rest and strayed(declared, 0.99 * motion, 2000, device) < 1e-5
     assert not strayed(declared, 0.99 * rest, 2000, device) < 1e-5
 
 
@@ -146,7 +145,7 @@ COLLAPSED = [
 ]
 
 
-@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
+@table("dtype", ["float32"], ["float32", "float64"])
 @pytest.mark.parametrize(
     "solver",
     [pytest.param(solver, id=repr(solver), marks=pytest.mark.slow if k % 3 else ()) for k, solver in enumerate(COLLAPSED)],
@@ -164,9 +163,9 @@ def test_02_a_collapsed_spring_has_no_direction(solver, dtype, device):
 
 
 @pytest.mark.parametrize("correction", ["per-sweep", "per-step"])
-@pytest.mark.parametrize("iterations", slow_but([3], [1, 3, 10]))
+@table("iterations", [3], [1, 3, 10])
 @pytest.mark.parametrize("substeps", [1, 5])
-@pytest.mark.parametrize("s", slow_but([0.5], [0.05, 0.5, 0.9]))
+@table("s", [0.5], [0.05, 0.5, 0.9])
 def test_03_pbd_hangs_too_long_by_the_known_amount(s, substeps, iterations, correction, device):
     """One mass hangs by g h²(1−s)ⁿ/(1−(1−s)ⁿ), of n and h; s′ = 1 − (1−s)^(1/n) removes n (Müller et al. 2006)."""
     # At one s the extension left is g h²(1−s)/s, and still that of h².
@@ -361,8 +360,7 @@ def test_05_order_within_a_colour_does_not_matter(kind, multipliers, device):
     """Colours that share no vertex that moves may run in any order, at once too: the same bits. One order for all may not."""
     declared = net("shear", n=8, stiffness=100.0)
     start = declared.mesh.points + 0.05 * np.random.default_rng(0).normal(size=(64, 3))
-    model = replace(declared, positions=start).build(device=device, dtype="float64")
-    found = []
+    model, found = replace(declared, positions=start).build(device=device, dtype="float64"), []
     for turned in (False, True):
         sweep = GaussSeidelSweep(model, model.positions, 0.1, kind, 1.0, multipliers=multipliers)
         if turned:
@@ -388,8 +386,7 @@ def test_06_rate_on_one_spring(k, pull, across, device):
     m, h = 0.05, 1 / 60
     # x̃ lies beyond the minimiser on the same ray, or a little beside it.
     start, gravity = np.array([1.0 + pull, 1e-6 * across, 0.0]), (0.0, -1e-4 if across else 0.0, 0.0)
-    declared = spring(start, k, m, gravity=gravity)
-    predicted = start + h**2 * np.array(gravity)
+    declared, predicted = spring(start, k, m, gravity=gravity), start + h**2 * np.array(gravity)
     ray = predicted / np.linalg.norm(predicted)
     length = (m / h**2 * np.linalg.norm(predicted) + k) / (m / h**2 + k)
     exact = length * ray
@@ -403,8 +400,7 @@ def test_06_rate_on_one_spring(k, pull, across, device):
     stepper.start()
     stepper.correction.assign(np.array([np.zeros(3), exact - predicted + 1e-6 * normal]))
     stepper._launch_gradient()
-    errors = [1e-6]
-    rate = (k / length) / (m / h**2 + k)
+    errors, rate = [1e-6], (k / length) / (m / h**2 + k)
     for _ in range(6):
         if errors[-1] * rate < 1e-9:  # below, rounding of x is above 1e-6 of it
             break
@@ -487,8 +483,7 @@ def test_07_weights_that_are_too_large_stall_and_too_small_oscillate(device):
         falls[r], rises[r] = worst[600] / worst[300], (worst / np.minimum.accumulate(worst)).max()
         counts[r] = after_steps(declared, solver, device)[1].iterations
     assert counts[0.03] < 1000 and min(counts[r] for r in (1e-3, 1.0, 10.0)) == 2000
-    assert rises[1e-3] > 100.0 and rises[1.0] == rises[10.0] == 1.0
-    assert falls[0.03] < 0.01 and falls[10.0] > 0.3
+    assert rises[1e-3] > 100.0 and rises[1.0] == rises[10.0] == 1.0 and falls[0.03] < 0.01 and falls[10.0] > 0.3
 
 
 SPLIT = {
@@ -503,7 +498,7 @@ SPLIT = {
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("name", slow_but(list(SPLIT)[:1], SPLIT))
+@table("name", list(SPLIT)[:1], SPLIT)
 def test_07_the_weight_by_itself_is_near_the_best(name, device):
     """r = 1/(2hω) brings a step to 1e-4 of its way in 1.3 times the iterations of the best of 11 weights, and often fewer."""
     # That is where the others have not ended after so many, however long they take.
@@ -549,10 +544,8 @@ def scaled_weight(rest: Any, i: int):
 @pytest.mark.parametrize("name", ["none", "anderson", "admm", "admm, light"])
 def test_07_units_of_the_local_coordinate_do_not_matter(name, device):
     """D times c and W over c: the same iterates, here with c = 8, which is exact in binary, to the bit."""
-    c = 8.0
-    declared = swinging(8)
-    declared = replace(declared, terms=declared.terms[:1])
-    solver = replace(METHODS[name], iterations=30)
+    c, declared = 8.0, swinging(8)
+    declared, solver = replace(declared, terms=declared.terms[:1]), replace(METHODS[name], iterations=30)
     expected, _ = after_steps(declared, solver, device)
     model = declared.build(device=device, dtype="float64")
     (springs,) = model.terms
@@ -573,8 +566,7 @@ def test_07_units_of_the_local_coordinate_do_not_matter(name, device):
 def test_08_few_iterations_are_softer_than_implicit_euler(form, device):
     """A swinging cloth: the largest stretch after a step falls with the sweeps to that of Newton, and the residual says so."""
     declared = swinging(8)
-    newton = newton_step(declared, device)
-    pairs = declared.terms[0].stencil(declared.mesh)
+    newton, pairs = newton_step(declared, device), declared.terms[0].stencil(declared.mesh)
     rest = pair_lengths(declared.mesh.points, pairs)
     stretches, residuals, gaps = [], [], []
     for iterations in (2, 20, 200, 2000):
@@ -613,7 +605,7 @@ COSTLY |= {name: 1.0 for name in STEPPING if name == "newton factorised" or name
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), STEPPING))
+@table("name", ("explicit", "newton", "xpbd"), STEPPING)
 def test_08_rounding_of_a_fall(name, device):
     """float32: what solves for x − x̃ and damps keeps strain at the rounding of a position, 1.3 ε|x|/edge = 1e-5."""
     # What keeps energy lets it walk, by less than 2ε(|x|/edge)√steps.
@@ -631,8 +623,7 @@ def test_08_rounding_of_a_fall(name, device):
     strain = np.abs(strains(declared, x)).max()
     of_position = eps * 4.0 / (4.0 / 63)  # ε|x|/edge
     walks = name in ("explicit", "newton midpoint")
-    assert strain < (2.0 * of_position * np.sqrt(steps) if walks else 1e-5)
-    assert (strain > 1e-5) == walks
+    assert strain < (2.0 * of_position * np.sqrt(steps) if walks else 1e-5) and (strain > 1e-5) == walks
 
 
 # --- 9. Locking: an irregular net cannot bend without straining or wrinkling.
@@ -707,18 +698,16 @@ THREADS = ("structural", "shear")
 
 
 @pytest.mark.host
-@pytest.mark.parametrize(
-    ("pattern", "pairs", "degrees", "keeps"),
-    slow_but(
-        [("equilateral", "edges", 17.0, True), ("alternating", "edges", 45.0, False)],
-        [
-            ("equilateral", "edges", 17.0, True),
-            *(("diagonal", "edges", degrees, True) for degrees in (0.0, 45.0)),
-            *(("alternating", pairs, 0.0, True) for pairs in ("edges", THREADS)),
-            *(("alternating", pairs, 45.0, False) for pairs in ("edges", THREADS)),
-            ("jittered", "edges", 0.0, False),
-        ],
-    ),
+@table(
+    "pattern, pairs, degrees, keeps",
+    [("equilateral", "edges", 17.0, True), ("alternating", "edges", 45.0, False)],
+    [
+        ("equilateral", "edges", 17.0, True),
+        *(("diagonal", "edges", degrees, True) for degrees in (0.0, 45.0)),
+        *(("alternating", pairs, 0.0, True) for pairs in ("edges", THREADS)),
+        *(("alternating", pairs, 45.0, False) for pairs in ("edges", THREADS)),
+        ("jittered", "edges", 0.0, False),
+    ],
 )
 def test_09_a_net_that_cannot_bend_without_strain_loses_its_curvature(pattern, pairs, degrees, keeps, device):
     """Springs alone, rolled up and let go, damped by implicit Euler: the part of the imposed angles that is left."""
@@ -802,8 +791,7 @@ def test_10_a_curved_rest_shape_is_flat_to_the_quadratic_form(term, expected, de
     mesh = wc.Mesh(rolled(flat.points, radius), flat.triangles)
     model = wc.Scene(mesh, density=0.1, terms=[term(stiffness=stiffness)]).build(device=device, dtype="float64")
     # Hinges inside have whole neighbourhoods: a third of the energy of 2 triangles each.
-    area = np.sqrt(3.0) / 4.0 * (1.0 / (n - 1)) ** 2
-    inside = ~np.isin(mesh.hinges, mesh.boundary).any(axis=1)
+    area, inside = np.sqrt(3.0) / 4.0 * (1.0 / (n - 1)) ** 2, ~np.isin(mesh.hinges, mesh.boundary).any(axis=1)
     found = energies_of_elements(model)[0][inside].sum() / (0.5 * stiffness / radius**2 * inside.sum() * 2.0 / 3.0 * area)
     # Hinges run in three directions, of which those inside are not all as many.
     assert found == pytest.approx(expected, abs=0.1 * expected + 1e-20)
@@ -813,14 +801,13 @@ def test_10_a_curved_rest_shape_is_flat_to_the_quadratic_form(term, expected, de
 # --- 11. Dihedral bending: |∇θ| = 1/height grows beyond bounds for slivers, and θ jumps by 2π when a hinge is folded flat.
 
 
-@pytest.mark.parametrize("dtype", slow_but(["float32"], ["float32", "float64"]))
-@pytest.mark.parametrize("scale", slow_but([0.01], [1.0, 0.1, 0.01, 0.001]))
+@table("dtype", ["float32"], ["float32", "float64"])
+@table("scale", [0.01], [1.0, 0.1, 0.01, 0.001])
 @pytest.mark.parametrize("height", [1e-2, 1e-5, 2e-6, 0.5e-6])
 def test_11_slivers_have_a_relative_guard(height, scale, dtype, device):
     """An apex at a height of ``height`` edges, turned by 1 rad: force cθ/height, the same mesh at any scale."""
     # Remedy: no force at 1e-6 of the longest side and below, at any scale; an absolute ε would turn small meshes off.
-    mesh = wc.Mesh(scale * EQUILATERAL, [[0, 1, 2], [1, 0, 3]])
-    x = scale * EQUILATERAL
+    mesh, x = wc.Mesh(scale * EQUILATERAL, [[0, 1, 2], [1, 0, 3]]), scale * EQUILATERAL
     x[2] = scale * np.array([0.5, height * np.cos(1.0), height * np.sin(1.0)])
     bent = wc.Scene(mesh, masses=np.ones(4), positions=x, terms=[wc.DihedralBending(stiffness=1.0)])
     (energy,), gradient = energy_and_gradient(bent.build(device=device, dtype=dtype))
@@ -836,7 +823,7 @@ def test_11_slivers_have_a_relative_guard(height, scale, dtype, device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("h", slow_but([1e-3], [1e-3, 5e-4]))
+@table("h", [1e-3], [1e-3, 5e-4])
 def test_11_a_hinge_folds_through_flat_and_goes_on(h, device):
     """θ jumps from π to −π: the force turns round, the energy ½c(θ − θ̄)², wrapped, does not jump; the run keeps its total."""
     # A wing of mass 1 at 4 m/s has 8 J; ½cπ² of folding is 5.7 J. It turns by more than 2π.

@@ -6,7 +6,7 @@ from scipy.spatial import Delaunay
 
 import warpcloth as wc
 from support.scenes import scene
-from support.steps import after_frames, after_steps, hanging_mass
+from support.steps import after_frames, after_steps
 from warpcloth.numerics.sweeps import GaussSeidelSweep, colours
 
 EPS = np.finfo(np.float64).eps
@@ -64,8 +64,7 @@ def test_grids_need_few_colours(pattern, springs, hinges):
     """Springs of a grid need no more than the most that meet at a vertex."""
     mesh = wc.Mesh.grid(32, 32, pattern=pattern)
     free = np.ones(len(mesh.points), dtype=bool)
-    assert np.bincount(mesh.edges.ravel()).max() == springs
-    assert colours(mesh.edges, free).max() + 1 == springs
+    assert np.bincount(mesh.edges.ravel()).max() == springs and colours(mesh.edges, free).max() + 1 == springs
     assert colours(mesh.hinges, free).max() + 1 <= hinges
 
 
@@ -91,13 +90,6 @@ def test_averaging_counts_the_constraints_of_the_busiest_vertex_that_moves(pins,
 
 
 # --- one hanging mass
-
-
-def test_no_stiffness_is_no_constraint(device):
-    """α̃ is infinite there, and 0·∞ must not get in."""
-    for solver in (wc.PBD(substeps=1), wc.PBD(substeps=1, correction="per-step"), wc.XPBD(substeps=1)):
-        x, _ = after_steps(hanging_mass(0.0, 1.0, 0.5), solver, device, "float32")
-        assert x[1, 1] == pytest.approx(-1.5 - 9.81 / 3600, rel=1e-6)
 
 
 def test_one_sweep_of_a_step_has_no_stiffness_to_spread(device):

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
 from support.steps import METHODS, after_frames, after_steps, newton_step, objective, swinging, unbalanced
 from warpcloth.core.constant_matrix import constant_matrices
 from warpcloth.core.hessian import Hessian
@@ -36,7 +36,7 @@ STRETCHES = {
 @pytest.mark.parametrize(
     "solver", [wc.ProjectiveDynamics(substeps=1, iterations=3000, tolerance=1e-9), wc.XPBD(substeps=1, iterations=3000)]
 )
-@pytest.mark.parametrize("stretch", slow_but(list(STRETCHES)[:1], STRETCHES))
+@table("stretch", list(STRETCHES)[:1], STRETCHES)
 def test_membranes_and_limits_meet_at_the_minimiser(stretch, solver, device):
     """Written without these solvers in mind: after three frames of a fall they are where Newton is."""
     mesh = wc.Mesh.grid(6, 6, pattern="alternating")
@@ -70,13 +70,6 @@ def test_equal_copies_share_their_factors(device):
 
 
 # --- the minimiser
-
-
-@pytest.mark.parametrize("name", METHODS)
-def test_a_few_iterations_are_reported(name, device):
-    """Where they end is in test_same_minimiser.py."""
-    _, stepper = after_steps(swinging(8), replace(METHODS[name], iterations=5, tolerance=1e-11), device)
-    assert stepper.results == [Result.ITERATIONS_USED_UP] and stepper.residual[0] > 1e-3
 
 
 def objectives(declared, solver, counts, device):
@@ -162,8 +155,7 @@ def iterates(method, H, A, b):
     for k in itertools.count():
         yield d
         gradient = H @ d - b
-        w = np.linalg.solve(A, gradient)
-        slot = k % m
+        w, slot = np.linalg.solve(A, gradient), k % m
         if k:
             y[slot], z[slot] = gradient - last[0], w - last[1]
         last = gradient, w
@@ -211,8 +203,7 @@ def test_a_step_starts_afresh(name, device):
 
 def test_residuals_of_admm(device):
     """The forces of y − z and of what z moved by, the largest of any vertex that moves; both end at 0."""
-    declared = swinging(8)
-    solver = wc.ADMM(substeps=1, iterations=7, weight=1.0)
+    declared, solver = swinging(8), wc.ADMM(substeps=1, iterations=7, weight=1.0)
     before, last = (after_steps(declared, replace(solver, iterations=count), device)[1] for count in (6, 7))
     model = last.model
     primal, dual = np.zeros((model.count, 3)), np.zeros((model.count, 3))
@@ -285,7 +276,7 @@ def test_the_best_weight_of_a_spring(device):
     np.testing.assert_allclose(best_weights(model, model.terms[0], h), 0.5 / (h * np.sqrt(2.0 * k / m)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", slow_but(("anderson", "admm"), METHODS))
+@table("name", ("anderson", "admm"), METHODS)
 def test_copies_converge_as_if_alone(name, device):
     """Copies of other stiffness need other numbers of iterations; none goes on when it is done, or notices the rest."""
     declared, stiffness = swinging(8), [30.0, 1e3, 100.0]
@@ -307,7 +298,7 @@ OTHERS |= {linear: wc.ConstrainedDynamics(substeps=1, linear=linear) for linear 
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")
-@pytest.mark.parametrize("name", slow_but(("anderson", "admm", *OTHERS), METHODS | OTHERS))
+@table("name", ("anderson", "admm", *OTHERS), METHODS | OTHERS)
 def test_what_is_not_finite_has_diverged(name, device):
     """And no other copy with it."""
     declared, solver = swinging(8), (METHODS | OTHERS)[name]
@@ -316,7 +307,7 @@ def test_what_is_not_finite_has_diverged(name, device):
     x, stepper = after_steps(declared, solver, device, copies=2, vary={"velocities": velocities})
     good, alone = after_steps(declared, solver, device)
     assert stepper.results == [alone.results[0], Result.DIVERGED]
-    assert name in OTHERS or alone.results == [Result.ITERATIONS_USED_UP]
+    assert name in OTHERS or (alone.results == [Result.ITERATIONS_USED_UP] and alone.residual[0] > 1e-3)
     assert not np.isfinite(stepper.residual[1]) and np.array_equal(x[:64], good)
     status = wc.simulate(replace(declared, velocities=velocities[1]), solver, device=device, dtype="float64", frames=3).status
     assert not status.ok and "diverged in frame 1" in status.message
@@ -337,8 +328,7 @@ def test_status_of_a_run_that_used_up_its_iterations(device):
 @pytest.mark.host
 def test_one_factorisation_serves_all_steps(monkeypatch, device):
     """One factorisation of the CPU for ten steps of any integrator; another when a solver is bound."""
-    built = []
-    factor = linear.constant_factor
+    built, factor = [], linear.constant_factor
     monkeypatch.setattr(linear, "constant_factor", lambda *given: built.append(1) or factor(*given))
     declared = swinging(8)
     for count, integrator in enumerate(("euler", "midpoint", "bdf2"), 1):
@@ -387,7 +377,7 @@ def test_admm_solves_local_problems_by_newton(name, device):
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered")
-@pytest.mark.parametrize("name", slow_but(["DihedralBending"], LOCAL))
+@table("name", ["DihedralBending"], LOCAL)
 def test_forces_beyond_all_numbers_have_diverged(name, device):
     """Newton's method on an element finds no step there, which is not to pass for its minimum."""
     velocities = np.where(np.arange(9)[:, None] == 4, 1e300, np.zeros(3))
@@ -410,7 +400,7 @@ def test_a_hinge_without_curvature_at_rest_counts(device):
 
 
 @pytest.mark.host
-@pytest.mark.parametrize("dtype", slow_but([], ["float32", "float64"]))
+@table("dtype", [], ["float32", "float64"])
 def test_admm_takes_a_crushed_membrane(dtype, device):
     """From all vertices but the pins on a line, and all at one position: no NaN, and the cloth comes back to its size."""
     mesh, terms = wc.Mesh.grid(5, 5, pattern="alternating"), LOCAL["NeoHookeanMembrane"]
@@ -438,14 +428,3 @@ def test_contact_pushes_out_at_once(speed, device):
     gap, predicted = x[:, 1], r - speed * h - 9.81 * h**2
     force = contact.stiffness * np.where(gap < 0.5 * r, 0.25 * r**2 / gap, r - gap)
     np.testing.assert_allclose(0.15 / h**2 * (gap - predicted), force, rtol=1e-5)
-
-
-@pytest.mark.parametrize("solver", [wc.ProjectiveDynamics, wc.ADMM])
-def test_no_stiffness_and_no_terms(solver, device):
-    """Then x̃ is the answer, in no iteration."""
-    mesh = wc.Mesh.grid(3, 3)
-    for terms in ([], [wc.Spring(stiffness=0.0)]):
-        scene = wc.Scene(mesh, density=0.1, terms=terms)
-        x, stepper = after_steps(scene, solver(substeps=1), device)
-        assert stepper.iterations == 0 and stepper.results == [Result.CONVERGED]
-        assert np.abs(x - mesh.points - [0.0, -9.81 / 3600, 0.0]).max() < 8 * EPS

@@ -13,9 +13,9 @@ import warp as wp
 import warpcloth as wc
 from support.meshes import PAIR
 from support.nets import net
-from support.rows import slow_but
+from support.rows import table
 from support.setups import MAIN, RUNS, SOLVERS, allocated, square
-from support.steps import after_frames, spring
+from support.steps import after_frames, after_steps, hanging_mass, spring
 from warpcloth.base.texts import words_of
 from warpcloth.core.capture import Segment, on_host
 from warpcloth.core.hessian import Hessian
@@ -81,7 +81,7 @@ def test_oscillator_keeps_its_invariant(method, omega_h, device):
     assert np.allclose(energies, expected, rtol=40 * 20 * EPS, atol=40 * 20 * EPS * omega**2)
 
 
-@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
+@table("name, dtype", [(name, "float32") for name in MAIN], RUNS)
 def test_free_fall(name, dtype, device):
     """y_n = −g h² n(n+1)/2 for every method of first order, −½g(nh)² for those of second, and no strain."""
     scene, steps = square(solver=SOLVERS[name], fps=600.0), 150
@@ -94,10 +94,7 @@ def test_free_fall(name, dtype, device):
 
 
 # Averaging by vertex keeps neither; Jacobi steps of one matrix keep momentum in the end, not on the way.
-@pytest.mark.parametrize(
-    "name",
-    slow_but(("explicit", "newton", "xpbd"), [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name]),
-)
+@table("name", ("explicit", "newton", "xpbd"), [name for name in SOLVERS if "vertex" not in name and "matrix-free" not in name])
 def test_momentum_is_conserved(name, device):
     """Inner forces cancel: P is kept; symplectic Euler and midpoint keep L too, the others lose it in x_new − x_old."""
     angular = name in ("explicit", "newton midpoint")
@@ -108,8 +105,7 @@ def test_momentum_is_conserved(name, device):
     ends = ((scene.mesh.points, scene.velocities), [array.numpy() for array in stepper.state])
     P, L = (np.array([f(x, mass * v).sum(axis=0) for x, v in ends]) for f in (lambda x, p: p, np.cross))
     bound = 25 * 100 * EPS * np.sum(mass * np.abs(scene.velocities))
-    assert np.abs(P[1] - P[0]).max() < bound
-    assert (np.abs(L[1] - L[0]).max() < bound) == angular
+    assert np.abs(P[1] - P[0]).max() < bound and (np.abs(L[1] - L[0]).max() < bound) == angular
 
 
 # Steps that end far from their minimum, by default tolerances, with few iterations or because rounding allows no more.
@@ -134,13 +130,11 @@ FLIGHTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "flight", "dtype"),
-    slow_but(
-        [("newton", "free", "float32"), *(("newton midpoint", flight, "float64") for flight in FLIGHTS)],
-        [(name, "free", dtype) for name in LOOSE for dtype in ("float32", "float64")]
-        + [("newton midpoint", flight, "float64") for flight in FLIGHTS if flight != "free"],
-    ),
+@table(
+    "name, flight, dtype",
+    [("newton", "free", "float32"), *(("newton midpoint", flight, "float64") for flight in FLIGHTS)],
+    [(name, "free", dtype) for name in LOOSE for dtype in ("float32", "float64")]
+    + [("newton midpoint", flight, "float64") for flight in FLIGHTS if flight != "free"],
 )
 def test_free_flight_keeps_momentum_wherever_steps_end(name, flight, dtype, device):
     """Gravity and a force add g + F/M of speed each second, and crumpled cloth nothing."""
@@ -159,6 +153,27 @@ def test_free_flight_keeps_momentum_wherever_steps_end(name, flight, dtype, devi
     expected = momenta[0] + steps * stepper.h * (mass.sum() * np.array([0.0, -0.1, 0.0]) + push)
     error = np.abs(momenta[1] - expected)[:, ["xyz".index(axis) for axis in axes]].max()
     assert error < 5 * steps * np.finfo(dtype).eps * (mass * np.abs(velocities)).sum()
+
+
+NO_ITERATION = wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)
+CONSTRAINED = [wc.ConstrainedDynamics(substeps=1, tolerance=1e-10, linear=linear) for linear in ("cg", "factorised")]
+PROJECTING = wc.PBD(substeps=1), wc.PBD(substeps=1, correction="per-step"), wc.XPBD(substeps=1)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("solver", [*NO_ITERATION, *CONSTRAINED, *PROJECTING], ids=repr)
+def test_nothing_to_solve(solver, dtype, device):
+    """No terms; no stiffness, of which the compliance is infinite; stencils of pins alone: free fall, and no NaN."""
+    base, ends = replace(hanging_mass(1.0, 1.0, 0.5), pins=[]), [Result.COMPLETED if solver in PROJECTING else Result.CONVERGED]
+    loose = [wc.Spring(stiffness=0.0), wc.Attachment(vertices=[1], stiffness=0.0)]
+    for terms in ([], loose[:1], loose):
+        x, stepper = after_steps(replace(base, terms=terms), solver, device, dtype, steps=3)
+        assert np.allclose(x[:, 1], np.array([0.0, -1.5]) - 9.81 * 6 / 3600, rtol=0.0, atol=8 * np.finfo(dtype).eps)
+        assert stepper.results == ends and (stepper.iterations == 0 or solver not in NO_ITERATION)
+    for stiffness in (1.0, np.inf) if solver not in NO_ITERATION else (1.0,):
+        pinned = replace(base, terms=[wc.Spring(stiffness=stiffness)], pins=[0, 1])
+        x, stepper = after_steps(pinned, solver, device, dtype, steps=3)
+        assert np.array_equal(x, pinned.positions) and stepper.results == ends
 
 
 def tensioned():
@@ -186,8 +201,7 @@ def test_newton_converges_quadratically(linear, device):
     # Order from three iterates in a row, log r₂/r₁ over log r₁/r₀, above rounding (2e-15). CG solves as well as r has fallen,
     # so that it keeps order 2.
     r = r[r > 1e-13]
-    assert len(r) >= 4
-    assert (np.log(r[2:] / r[1:-1]) / np.log(r[1:-1] / r[:-2]))[-1] > 1.7
+    assert len(r) >= 4 and (np.log(r[2:] / r[1:-1]) / np.log(r[1:-1] / r[:-2]))[-1] > 1.7
 
 
 REASONS = {
@@ -212,7 +226,7 @@ def test_steps_above_gershgorins_bound_warn(device):
         wc.Explicit(substeps=1).bind(scene.build(device=device))
 
 
-@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
+@table("name, dtype", [(name, "float32") for name in MAIN], RUNS)
 def test_a_sheet_at_rest_stays_there(name, dtype, device):
     """Its rest shape, one pinned vertex, no gravity: it moves by no more than rounding, and does not spin about the pin."""
     pin, solver, steps = 14, SOLVERS[name], 100
@@ -249,7 +263,7 @@ VARIED = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(["density", "where they are", "damping"], VARIED))
+@table("name", ["density", "where they are", "damping"], VARIED)
 def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
     """Found once for those that are alike, and the slow one only of those of which it may be the least; the quick one alone."""
     (copies, vary), built = VARIED[name], {"device": device, "dtype": "float64"}
@@ -260,8 +274,7 @@ def test_limits_of_copies_are_the_least_of_each(name, device, monkeypatch):
     model = scene.build(copies=copies, vary=vary, **built)
     assert step_limits(model) == tuple(alone.min(axis=0))
     near = np.unique(alone[0.98 * alone[:, 1] <= alone[:, 0].min()], axis=0)
-    assert len(searches) == len(near)
-    assert limit_in_motion(model) == alone[:, 1].min()
+    assert len(searches) == len(near) and limit_in_motion(model) == alone[:, 1].min()
     # Below the second a step is stable about the rest shape too: no need to look for the first.
     fps = 1.0 / (0.999 * alone[:, 1].min())
     wc.Explicit(substeps=1).bind(replace(scene, fps=fps, duration=1 / fps).build(copies=copies, vary=vary, **built))
@@ -282,7 +295,7 @@ def test_a_solver_without_a_step_takes_about_a_240th_of_a_second_or_its_limit(re
 
 SPRING, STVK = (kind(stiffness=np.inf) for kind in (wc.Spring, wc.StVKMembrane))
 IMPLICIT = wc.Newton(substeps=1), wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)
-CONSTRAINED = partial(wc.ConstrainedDynamics, substeps=1)
+ROWS = partial(wc.ConstrainedDynamics, substeps=1)
 INFINITE = "with infinite stiffness"
 REFUSED = [
     *((each, SPRING, f"cannot take Spring {INFINITE}; PBD") for each in (*IMPLICIT, wc.Explicit(substeps=1))),
@@ -296,10 +309,10 @@ REFUSED = [
         (wc.XPBD(integrator=way), SPRING, f"with integrator='{way}' cannot take Spring {INFINITE}")
         for way in ("midpoint", "bdf2")
     ),
-    (CONSTRAINED(), wc.StVKMembrane(stiffness=1.0), "cannot take StVKMembrane, whose energy is no square of a constraint; Exp"),
-    (CONSTRAINED(), wc.StrainLimit(most=1.1), f"cannot take StrainLimit {INFINITE}, as it has no scalar constraint; PBD"),
-    (CONSTRAINED(integrator="bdf2"), SPRING, "with integrator='bdf2' cannot take Spring with infinite"),
-    (CONSTRAINED(stabilisation="line-search"), SPRING, "with stabilisation='line-search' cannot take Spring"),
+    (ROWS(), wc.StVKMembrane(stiffness=1.0), "cannot take StVKMembrane, whose energy is no square of a constraint; Exp"),
+    (ROWS(), wc.StrainLimit(most=1.1), f"cannot take StrainLimit {INFINITE}, as it has no scalar constraint; PBD"),
+    (ROWS(integrator="bdf2"), SPRING, "with integrator='bdf2' cannot take Spring with infinite"),
+    (ROWS(stabilisation="line-search"), SPRING, "with stabilisation='line-search' cannot take Spring"),
     (wc.XPBD(), wc.ShellBending(stiffness=1), "cannot take ShellBending, .*; Explicit, Newton, ProjectiveDynamics or ADMM can"),
     (wc.Explicit(), wc.Spring(stiffness=1e30), "the scene is so stiff .* is stable only below .*e-1. s; take an implicit one"),
 ]
@@ -390,7 +403,7 @@ def test_a_frame_is_a_whole_number_of_steps(device):
         wc.Newton(dt=0.01).bind(square().build(device=device))
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), SOLVERS))
+@table("name", ("explicit", "newton", "xpbd"), SOLVERS)
 def test_a_step_allocates_nothing(name, device):
     """Of arrays of Warp; what scipy allocates to factorise on the host is outside the tracker's sight."""
     solver = replace(SOLVERS[name], substeps=5)
@@ -400,7 +413,7 @@ def test_a_step_allocates_nothing(name, device):
     assert allocated(lambda: [stepper.frame() for _ in range(3)], device) == 0
 
 
-@pytest.mark.parametrize(("name", "dtype"), slow_but([(name, "float32") for name in MAIN], RUNS))
+@table("name, dtype", [(name, "float32") for name in MAIN], RUNS)
 def test_the_same_run_gives_the_same_bits(name, dtype, device):
     def run():
         scene = square(solver=SOLVERS[name], damping=0.01, fps=600.0, pins="corners")
@@ -409,12 +422,10 @@ def test_the_same_run_gives_the_same_bits(name, dtype, device):
     assert np.array_equal(run(), run())
 
 
-@pytest.mark.parametrize(
-    ("name", "unlike"),
-    slow_but(
-        [(name, "masses and start") for name in ("explicit", "newton", "xpbd")],
-        [(name, unlike) for name in SOLVERS for unlike in UNLIKE if name in MAIN or unlike == "density, bending and damping"],
-    ),
+@table(
+    "name, unlike",
+    [(name, "masses and start") for name in ("explicit", "newton", "xpbd")],
+    [(name, unlike) for name in SOLVERS for unlike in UNLIKE if name in MAIN or unlike == "density, bending and damping"],
 )
 def test_copies_run_as_if_alone(name, unlike, device):
     """Every reduction is per copy: copies that differ do not notice one another."""
@@ -453,11 +464,10 @@ def stepped(stepper, steps):
     return np.array(states)
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "newton bdf2", "xpbd", "projective dynamics"), SOLVERS))
+@table("name", ("explicit", "newton bdf2", "xpbd", "projective dynamics"), SOLVERS)
 def test_a_copy_put_back_starts_again(name, device):
     """To the bit, though it has become NaN, and the other copies notice neither; keyframes start again as well."""
-    states = stepped(led(SOLVERS[name], device=device), 10)
-    stepper = led(SOLVERS[name], device=device)
+    states, stepper = stepped(led(SOLVERS[name], device=device), 10), led(SOLVERS[name], device=device)
     start = seen(stepper)
     assert np.array_equal(stepped(stepper, 3), states[:3])
     spoilt = stepper.state.x.numpy()
@@ -466,14 +476,12 @@ def test_a_copy_put_back_starts_again(name, device):
     others = stepped(stepper, 2)
     assert np.isnan(others[:, :, 1]).any()
     stepper.reset([False, True, False])
-    assert np.array_equal(seen(stepper)[:, 1], start[:, 1])
-    assert stepper.results[1] is Result.COMPLETED
+    assert np.array_equal(seen(stepper)[:, 1], start[:, 1]) and stepper.results[1] is Result.COMPLETED
     assert stepper.residual[1] == 0.0
     again = stepped(stepper, 5)
     assert np.array_equal(again[:, :, 1], states[:5, :, 1])
     assert np.array_equal(np.concatenate([others, again])[:, :, [0, 2]], states[3:, :, [0, 2]])
-    assert Result.DIVERGED not in stepper.results
-    assert np.isfinite(stepper.residual).all()
+    assert Result.DIVERGED not in stepper.results and np.isfinite(stepper.residual).all()
 
 
 def test_a_residual_starts_again_where_it_is_kept(device):
@@ -483,8 +491,7 @@ def test_a_residual_starts_again_where_it_is_kept(device):
     kept = stepper.residual.copy()
     stepper.reset([False, True, False])
     stepped(stepper, 2)
-    assert kept[1] > fresh.residual[1] == stepper.residual[1]
-    assert (stepper.residual[[0, 2]] >= kept[[0, 2]]).all()
+    assert kept[1] > fresh.residual[1] == stepper.residual[1] and (stepper.residual[[0, 2]] >= kept[[0, 2]]).all()
 
 
 @pytest.mark.parametrize("kind", ["numpy", "warp", "vectors", "Warp's own vectors"])
@@ -493,10 +500,8 @@ def test_copies_start_where_one_says(name, kind, device):
     """As a model does whose copies vary so; pins stay with their keyframes and have no velocity."""
     rng = np.random.default_rng(2)
     positions = np.array(square().mesh.points + 0.01 * rng.normal(size=(3, 36, 3)))
-    velocities = rng.normal(size=(3, 36, 3))
-    stepper = led(SOLVERS[name], device=device)
-    model = stepper.model
-    held = positions.copy()
+    velocities, stepper = rng.normal(size=(3, 36, 3)), led(SOLVERS[name], device=device)
+    model, held = stepper.model, positions.copy()
     held[:, [0, 5]] = square().mesh.points[[0, 5]]
     expected = stepped(led(SOLVERS[name], device=device, positions=held, velocities=velocities), 4)
     stepped(stepper, 6)
@@ -553,14 +558,12 @@ def test_the_state_is_shared_without_copies(module, device):
     if module in of_numpy and not wp.get_device(device).is_cpu:
         pytest.skip("NumPy has arrays of the host alone")
     stepper = led(SOLVERS["explicit"], device=device, dtype="float32")  # JAX makes float32 of float64 if not told otherwise
-    points = over(stepper.state.x)
-    before = seen(stepper)[0]
+    points, before = over(stepper.state.x), seen(stepper)[0]
     stepper.step()
     wp.synchronize_device(device)
     points = points.reshape(3, 36, 3)
     after = np.asarray(points.cpu() if hasattr(points, "cpu") else points)
-    assert np.array_equal(after, seen(stepper)[0])
-    assert not np.array_equal(after, before)
+    assert np.array_equal(after, seen(stepper)[0]) and not np.array_equal(after, before)
 
 
 def test_the_array_interface_names_the_memory(device):

@@ -8,7 +8,7 @@ import pytest
 import warpcloth as wc
 from support.energies import DENSITIES, FEW, energy_and_gradient, eps, every_dtype, material_of, random_rotation
 from support.meshes import irregular
-from support.rows import slow_but
+from support.rows import table
 from support.steps import after_steps
 from warpcloth.run.equilibrium import SETTLED
 from warpcloth.solvers.explicit import step_limits
@@ -38,8 +38,7 @@ def stretches(mesh, x):
 @pytest.mark.parametrize("name", DENSITIES)
 def test_patch(name, dtype, device):
     """Under x = GX + b inner forces vanish and U = u(G)·area; rotating the whole leaves U and turns the forces."""
-    random = np.random.default_rng(1)
-    mesh = irregular()
+    random, mesh = np.random.default_rng(1), irregular()
     inner = np.setdiff1d(np.arange(len(mesh.points)), mesh.boundary)
     assert len(inner) == 20
     for _ in range(5):
@@ -63,9 +62,7 @@ PULLED = [(name, ratio) for name in DENSITIES if name != "CorotatedMembrane" for
 PULLED.append(("CorotatedMembrane", 0.0))  # which has no other
 
 
-@pytest.mark.parametrize(
-    ("name", "ratio"), slow_but([each for each in PULLED if each[1] == 0.3 or each[0] == "CorotatedMembrane"], PULLED)
-)
+@table("name, ratio", [each for each in PULLED if each[1] == 0.3 or each[0] == "CorotatedMembrane"], PULLED)
 def test_tension_gives_back_the_moduli(name, ratio, device):
     """An irregular strip that is pulled at both ends by f a width: stretches f/Et and −νf/Et, up to the strain itself."""
     length, width = 2.0, 1.0
@@ -73,8 +70,7 @@ def test_tension_gives_back_the_moduli(name, ratio, device):
     ends = mesh.select("x < 0.001 or x > 1.999")
     # Ends of rows take half. Far targets pull with the same force wherever a vertex goes.
     share = np.where(np.isin(mesh.points[ends, 2], (0.0, width)), 0.5, 1.0) * width / 4
-    outwards = np.sign(mesh.points[ends, :1] - 1.0) * [1.0, 0.0, 0.0]
-    errors = []
+    outwards, errors = np.sign(mesh.points[ends, :1] - 1.0) * [1.0, 0.0, 0.0], []
     for strain in (1e-3, 1e-4):
         far = {"stiffness": strain * STIFFNESS * share / 1e4, "targets": mesh.points[ends] + 1e4 * outwards}
         pull = wc.Attachment(vertices=ends, **far)
@@ -131,10 +127,7 @@ def collapsed(start, ratio, **fields):
     return wc.Scene(mesh, density=0.1, terms=terms, **given)
 
 
-@pytest.mark.parametrize(
-    ("start", "ratio"),
-    slow_but(FROM, [*FROM, ("in one direction", 0.0), ("at random places", 0.0), ("in both directions", 0.49)]),
-)
+@table("start, ratio", FROM, [*FROM, ("in one direction", 0.0), ("at random places", 0.0), ("in both directions", 0.49)])
 def test_neo_hookean_recovers(start, ratio, device):
     """It unfolds to stretches of 1, however its start rounds."""
     declared = collapsed(start, ratio)
@@ -193,7 +186,7 @@ def flung(sheet, limit, seed=0, **scene):
     return wc.Scene(mesh, density=0.1, terms=[limit], velocities=velocities, gravity=WEIGHTLESS, **scene)
 
 
-@pytest.mark.parametrize("sheet", slow_but(list(SHEETS)[:1], SHEETS))
+@table("sheet", list(SHEETS)[:1], SHEETS)
 @pytest.mark.parametrize("limits", [BOTH, MOST, LEAST, NO_STRETCH], ids=str)
 @pytest.mark.parametrize("kind", [wc.SpringLimit, wc.StrainLimit])
 def test_converged_pbd_keeps_limits(kind, limits, sheet, device):
@@ -244,11 +237,10 @@ def test_limits_of_stretch_alone_add_no_energy(kind, sheet, limits, device):
 SERVED = [(kind, wc.Newton(substeps=4)) for kind in (wc.SpringLimit, wc.StrainLimit)]
 
 
-@pytest.mark.parametrize(("kind", "solver"), slow_but(SERVED, [*SERVED, (wc.SpringLimit, wc.Explicit(substeps=44))]))
+@table("kind, solver", SERVED, [*SERVED, (wc.SpringLimit, wc.Explicit(substeps=44))])
 def test_finite_limits_serve_solvers_that_need_forces(kind, solver, device):
     """A soft membrane that hangs by two corners stretches no further than its limit's own stiffness lets it."""
-    mesh = wc.Mesh.grid(9, 9, pattern="alternating")
-    worst = []
+    mesh, worst = wc.Mesh.grid(9, 9, pattern="alternating"), []
     for limits in ([], [kind(most=1.05, stiffness=2e3)]):
         terms = [wc.NeoHookeanMembrane(stiffness=5.0, poisson_ratio=0.3), *limits]
         scene = wc.Scene(mesh, density=0.1, terms=terms, pins="corners and z == 0", duration=0.4)
@@ -297,8 +289,7 @@ def test_moduli_of_a_material(cls):
 
 def test_a_stiffness_varies_and_the_ratio_stays(device):
     mesh = irregular()
-    x = mesh.points * [1.2, 1.0, 0.9]
-    stiffness = [10.0, 20.0, 70.0]
+    x, stiffness = mesh.points * [1.2, 1.0, 0.9], [10.0, 20.0, 70.0]
     scene = wc.Scene(mesh, density=0.1, terms=[wc.StVKMembrane(stiffness=1.0, poisson_ratio=0.4)], positions=x)
     model = scene.build(device=device, dtype="float64", copies=3, vary={"StVKMembrane.stiffness": stiffness})
     energy, _ = energy_and_gradient(model)

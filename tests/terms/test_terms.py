@@ -301,8 +301,7 @@ def gradient_by_lanes(part, dtype, lanes):
 
 def rest_mesh(seed=0):
     """An irregular sheet with a wave in it, about 1 m."""
-    random = np.random.default_rng(seed)
-    grid = wc.Mesh.grid(6, 5, pattern="alternating")
+    random, grid = np.random.default_rng(seed), wc.Mesh.grid(6, 5, pattern="alternating")
     points = grid.points + random.normal(scale=0.02, size=grid.points.shape)
     points[:, 1] += 0.05 * np.sin(5.0 * points[:, 0])
     return wc.Mesh(points, grid.triangles)
@@ -332,8 +331,7 @@ ON_MESH = {
 
 def stencils(term, state="random", scale=1.0, dtype="float64", device="cpu"):
     """All elements of an irregular mesh of size ``scale`` [m] in a state, each with its own stiffness."""
-    random = np.random.default_rng(1)
-    mesh = rest_mesh()
+    random, mesh = np.random.default_rng(1), rest_mesh()
     indices = ON_MESH[term.vertices](mesh)
     x = STATES[state](mesh.points) + random.normal(scale=0.03, size=mesh.points.shape)
     # Places in the precision of the test and round numbers of it, so that both precisions see the same ones.
@@ -408,8 +406,7 @@ def test_derivatives_are_differences(term, state, scale, device):
 
     # Nothing above is zero by accident, in any element: an energy that is switched off at small scales would pass.
     on = active(elements)
-    assert (energy > 1e-8 * stiff * length**2)[on].all()
-    assert (norms(gradient) > 1e-4 * stiff * length)[on].all()
+    assert (energy > 1e-8 * stiff * length**2)[on].all() and (norms(gradient) > 1e-4 * stiff * length)[on].all()
     assert (stiff > 0.1 * elements.weights()[1] * elements.stiffness * (1.0 if term.rows == 1 else length**-2))[on].all()
     assert (norms(gradient) == 0.0)[~on].all() and (stiff == 0.0)[~on].all()
 
@@ -438,8 +435,7 @@ def test_a_correction_is_a_move(term, device, dtype="float64"):
     moved = elements.at(elements.x + correction)
     stiff, length = norms(moved.hessian()), smallest_length(moved.x)
     rounding = FEW * eps(dtype) * np.abs(moved.x).max()
-    error = rounding * stiff
-    force = norms(moved.gradient())
+    error, force = rounding * stiff, norms(moved.gradient())
     assert (norms(elements.gradient(correction) - moved.gradient()) <= error).all()
     assert (abs(elements.energy(correction) - moved.energy()) <= rounding * (force + error)).all()
     if term.name in QUICK:
@@ -468,10 +464,8 @@ def test_both_bending_energies_are_one_at_small_angles(device):
     """A flat hinge of any shape, bent by θ: ½c|e|²θ²/(A₁ + A₂) to second order in θ."""
     angle, random = 0.01, np.random.default_rng(11)
     flat = EQUILATERAL + random.normal(scale=0.1, size=(50, 4, 3)) * [1.0, 1.0, 0.0]
-    e = unit(flat[:, 1] - flat[:, 0])
-    arm = flat[:, 3] - flat[:, 0]
-    foot = np.sum(arm * e, axis=1, keepdims=True) * e
-    bent = flat.copy()
+    e, arm = unit(flat[:, 1] - flat[:, 0]), flat[:, 3] - flat[:, 0]
+    foot, bent = np.sum(arm * e, axis=1, keepdims=True) * e, flat.copy()
     bent[:, 3] = flat[:, 0] + foot + np.cos(angle) * (arm - foot) + np.sin(angle) * np.cross(e, arm - foot)
     indices = np.arange(200).reshape(50, 4)
     areas = sum(0.5 * np.linalg.norm(np.cross(flat[:, 1] - flat[:, 0], flat[:, i] - flat[:, 0]), axis=1) for i in (2, 3))
@@ -498,8 +492,7 @@ def test_a_collapsing_spring_still_pushes(dtype, device):
 @every_dtype
 @pytest.mark.parametrize("state", STATES)
 def test_moving_the_whole_costs_nothing(term, state, dtype, device):
-    elements = stencils(term, state, 1.0, dtype, device)
-    random = np.random.default_rng(2)
+    elements, random = stencils(term, state, 1.0, dtype, device), np.random.default_rng(2)
     rotation, shift = random_rotation(random), random.normal(size=3)
     energy, gradient, stiff = elements.energy(), norms(elements.gradient()), norms(elements.hessian())
     for moved in (elements.x + shift, elements.x @ rotation.T, elements.x @ rotation.T + shift):
@@ -526,10 +519,8 @@ def test_no_total_force_and_torque(term, state, dtype, device):
 @every_term
 @pytest.mark.parametrize("policy", HessianPolicy, ids=lambda policy: policy.name)
 def test_hessian_turns_with_the_stencil(term, policy, device):
-    elements = stencils(term, "random", device=device)
-    rotation = random_rotation(np.random.default_rng(3))
-    turn = np.kron(np.eye(term.vertices), rotation)
-    turned = elements.at(elements.x @ rotation.T)
+    elements, rotation = stencils(term, "random", device=device), random_rotation(np.random.default_rng(3))
+    turn, turned = np.kron(np.eye(term.vertices), rotation), elements.at(elements.x @ rotation.T)
     if term.vertices == 1:  # the world turns too: a target, or a normal and a distance
         turned = turned._replace(rest=np.column_stack([elements.rest[:, :3] @ rotation.T, elements.rest[:, 3:]]))
     hessian = elements.hessian(policy)
@@ -599,8 +590,7 @@ def test_projection_gives_the_energy(term, state, dtype, device):
 @projecting
 @every_dtype
 def test_projection_is_the_nearest_point(term, dtype, device):
-    random = np.random.default_rng(4)
-    elements = stencils(term, "random", 1.0, dtype, device)
+    random, elements = np.random.default_rng(4), stencils(term, "random", 1.0, dtype, device)
     y = elements.y()
     p = elements.projection(y)
     error = FEW * eps(dtype) * (norms(y) + norms(p))
@@ -657,16 +647,14 @@ def test_without_stiffness_nothing_is_corrected(term, dtype, device):
 @pytest.mark.parametrize("name", ["CorotatedMembrane", "StrainLimit"])
 def test_two_pins_leave_one_vertex_its_best_place(name, hard, dtype, device):
     """With one free vertex of a triangle Fᵀ moves along one direction only: to the least ‖F − p‖ there is, for a hard one."""
-    elements = stencils(term_of(name), "compressed", 1.0, dtype, device)
-    free = 2
+    elements, free = stencils(term_of(name), "compressed", 1.0, dtype, device), 2
     inverse_mass = np.zeros(elements.x.shape[:2])
     inverse_mass[:, free] = 3.0
     elements = elements.hard() if hard else elements
     weights, measures = (values.astype(np.float64) for values in elements.weights())
     change, y, h = elements.correction(inverse_mass, 0.1), elements.y(), 0.1
     assert (change[:, :free] == 0.0).all()
-    w = weights[:, free]
-    softness = 1.0 / (elements.stiffness * measures * h * h)
+    w, softness = weights[:, free], 1.0 / (elements.stiffness * measures * h * h)
     wanted = np.einsum("em,emc->ec", w, elements.projection(y) - y)
     expected = 3.0 * wanted / (3.0 * np.sum(w * w, axis=1) + softness)[:, None]
     # Where α̃ is small beside G W Gᵀ, 1/α̃ enlarges rounding of what no vertex can move, but no vertex moves by it.
@@ -768,11 +756,9 @@ def in_each_precision(names):
 @pytest.mark.parametrize("state", STATES)
 def test_policies_of_membranes_are_those_of_the_eigenvalues(name, state, dtype, device):
     """∂²u/∂F² with its negative eigenvalues dropped or turned: at their places, at random F, and where σ₁ = σ₂."""
-    elements = stencils(term_of(name), state, 1.0, dtype, device)
-    random = np.random.default_rng(12)
+    elements, random = stencils(term_of(name), state, 1.0, dtype, device), np.random.default_rng(12)
     E = len(elements.x)
-    sizes = random.uniform(0.3, 2.0, (E, 1, 1))
-    rows = isometries(E, random)
+    sizes, rows = random.uniform(0.3, 2.0, (E, 1, 1)), isometries(E, random)
     for y in (elements.y(), random.normal(size=(E, 2, 3)), sizes * rows, np.array([[[2.0], [1e-3]]]) * rows, rows):
         raw, clamp, absolute = (elements.second_derivative(y, policy).astype(np.float64) for policy in HessianPolicy)
         values, vectors = np.linalg.eigh(0.5 * (raw + raw.transpose(0, 2, 1)))
@@ -857,8 +843,7 @@ def test_energy_of_stretches_and_of_simple_shear(name, ratio, dtype, device):
     elements = on_one_triangle(name, F, dtype, device, **given)
     expected = 0.5 * DENSITIES[name](long, short, mu, lam)
     # F is rounded by eps, and the strain with it, which is squared in u; the reference cancels in double precision.
-    error = FEW * eps(dtype) * long
-    force = norms(elements.gradient())
+    error, force = FEW * eps(dtype) * long, norms(elements.gradient())
     assert (abs(elements.energy() - expected) <= error * (force + (mu + lam + 1.0) * error) + FEW * eps("float64")).all()
 
 
@@ -1022,8 +1007,7 @@ def test_nan_is_never_swallowed(term, dtype, device):
                 x = elements.x.copy()
                 x[:, corner, coordinate] = np.nan
                 broken = elements.at(x)
-                assert np.isnan(broken.energy()).all()
-                assert np.isnan(broken.gradient()).any(axis=(1, 2)).all()
+                assert np.isnan(broken.energy()).all() and np.isnan(broken.gradient()).any(axis=(1, 2)).all()
                 if term.moves:
                     assert np.isnan(broken.correction(np.ones(x.shape[:2]), 0.1)).any(axis=(1, 2)).all()
 
@@ -1038,11 +1022,9 @@ def row_sums(model):
 
 @pytest.mark.parametrize("term", **named(DECLARABLE))
 def test_numbering_of_the_mesh_is_no_matter(term, device, dtype="float64"):
-    random = np.random.default_rng(7)
-    mesh = rest_mesh()
+    random, mesh = np.random.default_rng(7), rest_mesh()
     n = len(mesh.points)
-    x = mesh.points + random.normal(scale=0.03, size=(n, 3))
-    new = random.permutation(n)
+    x, new = mesh.points + random.normal(scale=0.03, size=(n, 3)), random.permutation(n)
     old = np.argsort(new)
     triangles = new[np.array([np.roll(corners, random.integers(3)) for corners in random.permutation(mesh.triangles)])]
     renumbered = wc.Mesh(mesh.points[old], triangles)
@@ -1092,8 +1074,7 @@ def test_gathering_is_scattering(term, dtype, device, monkeypatch):
     """The sum over the stencils of a vertex, the way of a GPU, is the sum over stencils; and each run gives the same bits."""
     # Also that of several threads a vertex: 4 in float32, 3 in float64. The slots of a vertex may be a multiple of them or not.
     monkeypatch.setattr(quadratic, "CHUNK", 7)  # of matrices, which are then added up in several
-    random = np.random.default_rng(8)
-    mesh = rest_mesh()
+    random, mesh = np.random.default_rng(8), rest_mesh()
     places = mesh.points + random.normal(scale=0.03, size=mesh.points.shape)
     # Scattering is for one thread, of the CPU.
     model, other = (model_of(mesh, places, [term.name], dtype, each, pins=[0, 7], copies=2) for each in (device, "cpu"))
@@ -1145,8 +1126,7 @@ def test_bending_that_gathers_by_element_has_no_net_force(device):
     mesh, radius = wc.Mesh.grid(12, 12, size=1.0), 100.0 / 11.0
     x, _y, z = mesh.points.T
     rolled = np.column_stack([radius * np.sin(x / radius), radius * (1.0 - np.cos(x / radius)), z])
-    model = model_of(mesh, rolled, ["QuadraticBending"], "float32", device)
-    nets = {}
+    model, nets = model_of(mesh, rolled, ["QuadraticBending"], "float32", device), {}
     for rows in (True, False):
         part, arrays = gathered(model, model.terms[0], rows=rows)
         assert bool(part.rows) == rows
@@ -1217,13 +1197,11 @@ def test_rows_of_constraints_gather_what_they_scatter(term, scalar, curved, devi
         random = np.random.default_rng(11)
         slopes.assign(random.normal(size=slopes.numpy().shape))
         lambdas = model.array(random.normal(size=3 * per_copy), model.dtype)
-        active = wp.array([1, 0, 1], dtype=wp.int32, device=each)
-        held = jacobian.held_rows(*key)()
+        active, held = wp.array([1, 0, 1], dtype=wp.int32, device=each), jacobian.held_rows(*key)()
         held.slopes, held.multipliers, held.active = slopes, lambdas, active
         held.layout.per_copy, held.layout.first, held.layout.rows_per_copy = elements.per_copy, first, per_copy
         found += added(model, factory(*key), elements, held, factory is jacobian.gather_rows)
-    assert agree(found, dtype)
-    assert all((each[model.per_copy : 2 * model.per_copy] == THERE).all() for each in found)
+    assert agree(found, dtype) and all((each[model.per_copy : 2 * model.per_copy] == THERE).all() for each in found)
 
 
 def test_hessian_matrix_is_differences_of_the_gradient(device):
