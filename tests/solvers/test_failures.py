@@ -13,11 +13,10 @@ import warp as wp
 from scipy.optimize import least_squares
 from scipy.sparse import diags
 from scipy.sparse.linalg import eigsh
-from scipy.spatial import Delaunay
 
 import warpcloth as wc
 from support.energies import EQUILATERAL, bending_density, energies_of_elements, energy_and_gradient
-from support.meshes import kite, rolled
+from support.meshes import delaunay, kite, rolled
 from support.nets import NETS, jacobian, net
 from support.rows import slow_but, table
 from support.scenes import scene
@@ -629,15 +628,11 @@ def test_08_rounding_of_a_fall(name, device):
 # --- 9. Locking: an irregular net cannot bend without straining or wrinkling.
 
 
-def jittered(n, seed=0):
+def jittered(n):
     """Delaunay's triangles of n² vertices of a unit square, those inside moved by up to half a cell."""
     grid = wc.Mesh.grid(n, n).points[:, [0, 2]]
     inside = ((grid > 1e-9) & (grid < 1.0 - 1e-9)).astype(float)
-    positions = grid + 0.5 / (n - 1) * inside * np.random.default_rng(seed).uniform(-1.0, 1.0, size=grid.shape)
-    triangles = Delaunay(positions).simplices
-    edges = positions[triangles[:, 1:]] - positions[triangles[:, :1]]
-    area = np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0])
-    return wc.Mesh(np.insert(positions, 1, 0.0, axis=1), triangles[area > 1e-3 / n**2])
+    return delaunay(grid + 0.5 / (n - 1) * inside * np.random.default_rng(0).uniform(-1.0, 1.0, size=grid.shape))
 
 
 @pytest.mark.parametrize("edge", [0.02, 0.05, 0.1])

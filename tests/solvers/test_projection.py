@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import Delaunay
 
 import warpcloth as wc
+from support.meshes import delaunay
 from support.scenes import scene
 from support.steps import after_frames, after_steps
 from warpcloth.numerics.sweeps import GaussSeidelSweep, colours
@@ -15,16 +15,10 @@ EPS = np.finfo(np.float64).eps
 # --- colours
 
 
-def delaunay():
-    """An irregular sheet of 200 vertices."""
-    points = np.random.default_rng(3).uniform(size=(200, 2))
-    return wc.Mesh(np.insert(points, 1, 0.0, axis=1), Delaunay(points).simplices)
-
-
 PATTERNS = ("diagonal", "alternating", "equilateral")
 MESHES = {
     **{pattern: lambda pattern=pattern: wc.Mesh.grid(9, 7, pattern=pattern) for pattern in PATTERNS},
-    "Delaunay": delaunay,
+    "Delaunay": lambda: delaunay(np.random.default_rng(3).uniform(size=(200, 2))),
     "bunny": lambda: scene("bunny").mesh,
     "chain": lambda: wc.Mesh.chain(12),
 }

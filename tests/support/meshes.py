@@ -1,6 +1,7 @@
 """Small meshes that several tests need."""
 
 import numpy as np
+from scipy.spatial import Delaunay
 
 import warpcloth as wc
 
@@ -39,6 +40,14 @@ def joined(*parts):
     firsts = np.cumsum([0, *(len(points) for points, _ in parts)])
     triangles = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
     return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
+
+
+def delaunay(points):
+    """A flat mesh of points (n, 2) in x and z, without the slivers on the outline."""
+    triangles = Delaunay(points).simplices
+    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    return wc.Mesh(np.insert(points, 1, 0.0, axis=1), triangles[areas > 1e-3 * np.median(areas)])
 
 
 def rolled(points, radius, degrees=0.0):

@@ -7,29 +7,19 @@ import numpy as np
 import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import Delaunay
 
 import warpcloth as wc
 from support.continuum import hill, turn
 from support.continuum import jittered as irregular
 from support.energies import energy_and_gradient, every_dtype
 from support.energies import eps as eps_of
-from support.meshes import rolled
+from support.meshes import delaunay, rolled
 from support.steps import after_steps, newton_step
 from warpcloth.core.hessian import Hessian
 from warpcloth.lab import elastica
 from warpcloth.mesh.curvature import curvature_operator
 
 EPS = eps_of("float64")
-
-
-def _triangulated(points):
-    """A flat mesh of points (n, 2) in x and z, without the slivers on the outline."""
-    triangles = Delaunay(points).simplices
-    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
-    areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
-    triangles = triangles[areas > 1e-3 * np.median(areas)]
-    return wc.Mesh(np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1), triangles)
 
 
 def _scattered(n, stretch=0.0):
@@ -42,7 +32,7 @@ def _scattered(n, stretch=0.0):
     moved = ((points > 0.0) & (points < 1.0)).all(axis=1)
     moved[len(points) // 2] = False
     random = np.random.default_rng(1)
-    return _triangulated(points + np.where(moved[:, None], random.uniform(-0.25, 0.25, points.shape) * spacing, 0.0))
+    return delaunay(points + np.where(moved[:, None], random.uniform(-0.25, 0.25, points.shape) * spacing, 0.0))
 
 
 def _equilateral(n):
@@ -53,7 +43,7 @@ def _equilateral(n):
         if (row - rows // 2) % 2:
             line = np.concatenate([[0.0], (line[1:] + line[:-1]) / 2.0, [1.0]])
         points.append(np.stack([line, np.full(len(line), row / rows)], axis=1))
-    return _triangulated(np.concatenate(points))
+    return delaunay(np.concatenate(points))
 
 
 MESHES = {

@@ -12,7 +12,7 @@ import warpcloth as wc
 from support.continuum import turn
 from support.energies import energy_and_gradient
 from support.energies import eps as eps_of
-from support.meshes import rolled
+from support.meshes import delaunay, rolled
 from support.rows import table
 from support.steps import after_steps, newton_step
 from warpcloth.core.hessian import Hessian
@@ -28,7 +28,7 @@ def _jittered(n):
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     inner = ((points > 0.0) & (points < 1.0)).all(axis=1)
     points += np.where(inner[:, None], np.random.default_rng(1).uniform(-0.25, 0.25, points.shape) / (n - 1), 0.0)
-    return wc.Mesh(np.insert(points, 1, 0.0, axis=1), Delaunay(points).simplices)
+    return delaunay(points)
 
 
 MESHES = {
