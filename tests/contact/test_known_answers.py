@@ -55,10 +55,6 @@ def of_triangles(plane):
     return wc.MeshCollider((grid.points - [3.9, 0.0, 3.95]) @ frame, grid.triangles, friction=plane.friction)
 
 
-def on_triangles(scene):
-    return replace(scene, colliders=[of_triangles(scene.colliders[0])])
-
-
 def sheet(gap, stiffness=1000.0, **fields):
     """A square of nine vertices at a distance ``gap`` [m] above a plane."""
     grid = wc.Mesh.grid(3, 3, size=0.1)
@@ -66,7 +62,9 @@ def sheet(gap, stiffness=1000.0, **fields):
     return cloth(mesh, terms=[wc.Spring(stiffness=stiffness)], colliders=[wc.Plane()], **fields)
 
 
-def run(scene, name, substeps, device):
+def run(scene, name, substeps, device, mesh=False):
+    """With the plane of a scene, or an open mesh in it."""
+    scene = replace(scene, colliders=[of_triangles(scene.colliders[0])]) if mesh else scene
     return wc.simulate(scene, replace(SOLVERS[name], substeps=substeps), dtype="float64", device=device)
 
 
@@ -79,7 +77,7 @@ def run(scene, name, substeps, device):
 def test_a_sheet_slides_down_a_slope(name, law, friction, mesh, device):
     """a = g(sin θ − μ cos θ), of the second half, when anchors are dragged along; less ke/ρ if each spring bears e more."""
     scene, _, down = incline(30.0, law(friction), duration=0.5)
-    animation = run(on_triangles(scene) if mesh else scene, name, 60 if name == "explicit" else 2, device)
+    animation = run(scene, name, 60 if name == "explicit" else 2, device, mesh)
     along = (animation.velocities @ down).mean(axis=1)
     expected = G * (0.5 - friction * np.sqrt(0.75)) - (law is Sticky) * 10.0 * G / 1e-3 * EXTRA
     assert (along[-1] - along[15]) / 0.25 == pytest.approx(expected, rel=1e-4)
@@ -119,11 +117,10 @@ def test_what_hits_a_ball_slides_off(friction, device):
 def test_a_sheet_sticks_to_a_slope(name, law, tangent, mesh, device):
     """Friction does not creep; explicit steps swing by ε = μN/(kA), springs of the outside law stretch by ρg sin θ/(ks)."""
     scene, _, down = incline(np.degrees(np.arctan(tangent)), law(0.3), duration=1.0)
-    animation = run(on_triangles(scene) if mesh else scene, name, 60 if name == "explicit" else 2, device)
+    animation = run(scene, name, 60 if name == "explicit" else 2, device, mesh)
     along = ((animation.points - animation.points[0]) @ down).mean(axis=1)
     held, swings = ((0.3e-4 + EXTRA) / SOFTNESS, 1e-4) if law is Sticky else (0.3e-4, 0.3e-4)
-    assert abs(along[-1] - along[30]) < (swings if name == "explicit" else 1e-9)
-    assert 0.0 < along[-1] < 20.0 * held
+    assert abs(along[-1] - along[30]) < (swings if name == "explicit" else 1e-9) and 0.0 < along[-1] < 20.0 * held
 
 
 @each_solver
@@ -139,7 +136,7 @@ def test_the_gap_under_a_pressure(name, pressure, gap, mesh, device):
     start = gap if name == "explicit" else 1e-3  # what nothing damps does not come to rest
     contact = wc.Contact(distance=1e-3, stiffness=1e7)
     scene = sheet(start, contact=contact, gravity=(0.0, -pressure / DENSITY, 0.0), duration=0.25)
-    animation = run(on_triangles(scene) if mesh else scene, name, 100 if name == "explicit" else 2, device)
+    animation = run(scene, name, 100 if name == "explicit" else 2, device, mesh)
     np.testing.assert_allclose(animation.points[-1][:, 1], gap, rtol=1e-3)
     assert animation.cut == 0.0
 
@@ -156,12 +153,10 @@ def test_the_gap_under_a_pressure(name, pressure, gap, mesh, device):
     constrained_dynamics=wc.ConstrainedDynamics(substeps=4),
 )
 def test_a_pressure_holds_a_sheet_where_it_balances(solver, gravity, device, pressure=14.715, k=1e7, r=1e-3):
-    """The gap r − p/k and the force pA, with hardly any gravity or none.
-
-    x̃ is 0.7 mm deep in the plane, where contact gives 1e7 m/s², but the residual is relative to p/ρ. The stiffness k/ρ is above
-    the inertia 1/h², so that a residual of 1e-3 p/ρ leaves 1e-3 p/k at the most, and as much again of velocity from the step
-    before.
-    """
+    """The gap r − p/k and the force pA, with hardly any gravity or none."""
+    # x̃ is 0.7 mm deep in the plane, where contact gives 1e7 m/s², but the residual is relative to p/ρ. The stiffness k/ρ is
+    # above the inertia 1/h², so that a residual of 1e-3 p/ρ leaves 1e-3 p/k at the most, and as much again of velocity from the
+    # step before.
     fields = {"gravity": (0.0, -gravity, 0.0), "loads": [wc.Pressure(vertices="all", pressure=-pressure)], "duration": 0.2}
     scene = sheet(r - pressure / k, contact=wc.Contact(distance=r, stiffness=k), **fields)
     animation = wc.simulate(scene, solver, dtype="float64", device=device, record="reactions")
@@ -231,14 +226,11 @@ def test_a_belt_slides_over_a_polygon(device, friction=0.3):
     solver = wc.Newton(substeps=2, tolerance=1e-5, linear="factorised")
     points = wc.simulate(capstan, solver, dtype="float64", device=device).points[16:]
     edges = np.diff(points[:, : points.shape[1] // 2], axis=1)
-    turns = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1)
-    middle = edges.shape[1] // 2
+    turns, middle = np.diff(np.unwrap(np.arctan2(edges[..., 2], edges[..., 0])), axis=1), edges.shape[1] // 2
     inner = slice(middle - 3, middle + 3)  # vertex i + 1 is between the edges i and i + 1
-    half = friction * np.tan(0.5 * turns[:, inner])
-    found = tensions(capstan, points)
+    half, found = friction * np.tan(0.5 * turns[:, inner]), tensions(capstan, points)
     ratio = found[:, inner.stop] / found[:, inner.start] / np.prod((1.0 + half) / (1.0 - half), axis=1)
-    assert (turns[:, inner] > 0.99 * np.pi / 8).all()
-    assert np.mean(ratio) == pytest.approx(1.0, abs=1e-4)
+    assert (turns[:, inner] > 0.99 * np.pi / 8).all() and np.mean(ratio) == pytest.approx(1.0, abs=1e-4)
 
 
 @pytest.mark.parametrize("softer", (1.0, 20.0))
@@ -251,38 +243,30 @@ def test_a_belt_presses_on_a_drum(softer, device):
     edge = np.linalg.norm(points[0] - points[1])
     inner = points[:, 2] < -0.05
     turn = 2.0 * np.arcsin(0.5 * edge / np.linalg.norm(points[inner][:, [0, 2]], axis=1))
-    radius = 0.5 * edge / np.sin(0.5 * turn)
-    gaps = capstan.colliders[0].distances(points[inner])
+    radius, gaps = 0.5 * edge / np.sin(0.5 * turn), capstan.colliders[0].distances(points[inner])
     k, r, pressure = contact.stiffness, contact.distance, 20.0 / radius
     expected = r - pressure / k if softer == 1.0 else k * r**2 / (4.0 * pressure)
     np.testing.assert_allclose(r - gaps if softer == 1.0 else gaps, r - expected if softer == 1.0 else expected, rtol=0.01)
 
 
 def critical(friction, radius, length=1.0):
-    """The overhang of a limp sheet beyond the flat top at which it slips off a round edge [m], of any radius.
+    """The overhang of a limp sheet beyond the flat top at which it slips off a round edge [m], of any radius."""
+    # Along the edge dT/dθ = μ(T + R cos θ) − R sin θ, with T over the weight per area, from μ times what lies on the top.
 
-    Along the edge dT/dθ = μ(T + R cos θ) − R sin θ, with T over the weight per area, from μ times what lies on the top.
-    """
+    def slope(at, T):
+        return friction * (T + radius * np.cos(at)) - radius * np.sin(at)
 
     def pulls(over):
-        along = solve_ivp(
-            lambda at, T: friction * (T + radius * np.cos(at)) - radius * np.sin(at),
-            (0.0, 0.5 * np.pi),
-            [friction * (length - over)],
-            rtol=1e-9,
-        )
+        along = solve_ivp(slope, (0.0, 0.5 * np.pi), [friction * (length - over)], rtol=1e-9)
         return over - 0.5 * np.pi * radius - along.y[0, -1]
 
     return brentq(pulls, 0.0, length)
 
 
-@methods(
-    "explicit",
-    "newton",
-    explicit=wc.Explicit(substeps=200),
-    newton=wc.Newton(substeps=2, tolerance=1e-4),
-    xpbd=wc.XPBD(substeps=20, iterations=10),
-)
+OVER = {"explicit": wc.Explicit(substeps=200), "newton": wc.Newton(substeps=2, tolerance=1e-4)}
+
+
+@methods("explicit", "newton", xpbd=wc.XPBD(substeps=20, iterations=10), **OVER)
 def test_an_overhang_slips_or_sticks(solver, device):
     """One edge more than what the friction holds slips, one edge less sticks."""
     friction, elements, radius = 0.3, 40, 0.031
@@ -305,15 +289,14 @@ def deeper(solver, duration, device, **fields):
     return depths[-1] / (depths[0] * np.cosh(duration * np.sqrt(G)))
 
 
+PD = wc.ProjectiveDynamics(substeps=4, integrator="bdf2", tolerance=1e-2, iterations=200, acceleration="l-bfgs")
+
+
 @methods(
-    "projective_dynamics",
-    "explicit",
-    "xpbd",
+    *("projective_dynamics", "explicit", "xpbd"),
     explicit=wc.Explicit(substeps=300),
     newton=wc.Newton(substeps=4, integrator="bdf2", tolerance=1e-6),
-    projective_dynamics=wc.ProjectiveDynamics(
-        substeps=4, integrator="bdf2", tolerance=1e-2, iterations=200, acceleration="l-bfgs"
-    ),
+    projective_dynamics=PD,
     xpbd=wc.XPBD(substeps=50, iterations=10),
 )
 def test_a_chain_slides_over_an_edge(solver, device):
@@ -394,15 +377,12 @@ def test_a_ring_bears_its_load(name, device):
     solver, load, fields, errors = RINGS[name]
     declared = ring.scene(load, **fields)
     found, high = borne(declared, wc.simulate(declared, solver, dtype="float64", device=device).points[-1])
-    assert found == pytest.approx(load, rel=errors[0])
-    assert high == pytest.approx(ring.height(load), rel=errors[1])
+    assert found == pytest.approx(load, rel=errors[0]) and high == pytest.approx(ring.height(load), rel=errors[1])
 
 
 def test_the_answers_of_a_ring():
     """The quadrature against elliptic integrals: where the ring begins to lie flat, and beyond."""
-    assert [ring.height(1.0), ring.height(2.0), ring.height(2.786408)] == pytest.approx(
-        [0.9165281, 0.8132354, 0.717770], abs=1e-6
-    )
+    assert [*map(ring.height, (1.0, 2.0, 2.786408))] == pytest.approx([0.9165281, 0.8132354, 0.717770], abs=1e-6)
     assert 4.0 * ring.height(4.0) ** 2 == pytest.approx(5.7421601 / 4.0, rel=1e-6)
 
 
@@ -411,10 +391,8 @@ def test_pads_hold_what_they_pinch(soft, gap, held, device):
     """A sheet between two pads hangs on three vertices with the default k; 10 w/r lets it fall. Gaps of r/4 are named."""
     grid, r = wc.Mesh.grid(17, 17, size=0.3), 2e-3
     mesh = wc.Mesh(np.stack([grid.points[:, 0], -grid.points[:, 2], 0.0 * grid.points[:, 0]], axis=1), grid.triangles)
-    pads = [
-        wc.Box(size=(0.06, 0.03, 0.02), position=(0.15, -0.02, side * (0.01 + 0.5 * gap)), friction=0.3, name=name)
-        for name, side in (("front", 1.0), ("back", -1.0))
-    ]
+    pad, z = wc.Box(size=(0.06, 0.03, 0.02), friction=0.3), 0.01 + 0.5 * gap
+    pads = [replace(pad, position=(0.15, -0.02, at), name=name) for name, at in (("front", z), ("back", -z))]
     contact = wc.Contact(distance=r, stiffness=10.0 * DENSITY * G / r if soft else None)
     scene = cloth(mesh, stiffness=300.0, bending=2e-5, colliders=pads, contact=contact)
     run = wc.simulate(scene, wc.Newton(substeps=4), frames=30, dtype="float64", device=device)

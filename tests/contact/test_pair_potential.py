@@ -64,10 +64,8 @@ def pair_of(ratio, gap):
 
 
 def places_at_a_fold():
-    """Vertices near two faces at 60° that meet in the edge (0, 0, ±1): in the valley, by the edge, by its end, by a face.
-
-    In the valley the vertex lies r/10 from one face and 0.6 r from the other: the edge has m = −1 on both sides.
-    """
+    """Vertices near two faces at 60° that meet in the edge (0, 0, ±1): in the valley, by the edge, by its end, by a face."""
+    # In the valley the vertex lies r/10 from one face and 0.6 r from the other: the edge has m = −1 on both sides.
     angle = np.arctan2(0.1 * 0.75**0.5, 0.6 + 0.05)  # sin(60° − angle) = 6 sin(angle)
     valley = 0.1 * R / np.sin(angle) * np.array([np.sin(np.pi / 6 - angle), np.cos(np.pi / 6 - angle), 0.0])
     face = np.array([0.25, 0.4330127018922193, 0.1]) + 0.3 * R * np.array([0.75**0.5, -0.5, 0.0])
@@ -77,10 +75,8 @@ def places_at_a_fold():
 @pytest.mark.parametrize("policy", [HessianPolicy.RAW, HessianPolicy.CLAMP])
 @pytest.mark.parametrize("place", places_at_a_fold())
 def test_the_hessian_is_the_derivative_of_the_force(place, policy, device):
-    """By central differences with respect to the vertex; clamped, along the normal of the nearest face in the valley.
-
-    Without the edge of m = −1 the clamped Hessian is 160 times smaller there. It lacks what curves across the normal.
-    """
+    """By central differences with respect to the vertex; clamped, along the normal of the nearest face in the valley."""
+    # Without the edge of m = −1 the clamped Hessian is 160 times smaller there. It lacks what curves across the normal.
     faces = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.5, 0.75**0.5, 0.0], [-0.5, 0.75**0.5, 0.0]])
     away = 1.0 if place == "valley" else -1.0
     vertex = places_at_a_fold()[place] + np.array([[0.0, 0.0, 0.0], [0.1, away, 0.3], [0.1, away, -0.3]])

@@ -35,8 +35,7 @@ def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
     lists = zip(kinds, np.split(found.distances.numpy()[: sum(map(len, kinds))], [len(kinds[0])]), strict=True)
     for (stencils, distances), (s, now, rest) in zip(lists, all_pairs(mesh, x), strict=True):
         cutoff = np.where(piece[s[:, 0]] == piece[s[:, 3]], np.minimum(distance, rest / 2), distance)
-        gap = now - cutoff - skin
-        count = len(stencils) // model.copies
+        gap, count = now - cutoff - skin, len(stencils) // model.copies
         copies = np.arange(model.copies)[:, None, None] * n
         np.testing.assert_array_equal(stencils, (stencils[:count] + copies).reshape(-1, 4))
         weights = float(n) ** np.arange(4)  # of a stencil, as one number
@@ -44,8 +43,7 @@ def check(mesh, x, distance, skin, dtype="float32", device="cpu", **options):
         index = np.argsort(want)
         index = index[np.searchsorted(want, have, sorter=index).clip(max=max(len(want) - 1, 0))]
         np.testing.assert_array_equal(want[index], have)
-        assert (gap[index] < rounding).all()
-        assert np.isin(np.flatnonzero(gap < -rounding), index).all()
+        assert (gap[index] < rounding).all() and np.isin(np.flatnonzero(gap < -rounding), index).all()
         np.testing.assert_allclose(distances, np.tile(cutoff[index], model.copies), rtol=1e-5, atol=rounding)
         if model.order is None:
             assert (np.diff(index) > 0).all()
@@ -107,8 +105,7 @@ def test_the_pairs_are_those_among_all_pairs(name, dtype, device):
     """Of cloth at rest, folded, turned and far from the origin, and that has shrunk to a point, or was blown up."""
     mesh, gap, options = FOLDED[name]
     rng = np.random.default_rng(3)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    x = folded(mesh, rng, gap)
+    turn, x = np.linalg.qr(rng.normal(size=(3, 3)))[0], folded(mesh, rng, gap)
     far = x @ turn + 20.0 * np.ptp(mesh.points, axis=0).max()
     for points in (x, far):
         assert min(check(mesh, points, gap, gap / 2, dtype, device, **options)) > 20
@@ -122,8 +119,7 @@ def test_the_pairs_are_those_among_all_pairs(name, dtype, device):
 
 def test_chains_have_pairs_of_edges_alone(device):
     """A chain that turns back on itself, and a second beside it; vertices of no edge take no part."""
-    rng = np.random.default_rng(0)
-    chain = wc.Mesh.chain(40)
+    rng, chain = np.random.default_rng(0), wc.Mesh.chain(40)
     mesh = wc.Mesh.join({"one": chain, "other": wc.Mesh(chain.points + 0.005, edges=chain.edges)})
     x = np.cumsum(rng.uniform(-0.02, 0.02, mesh.points.shape), axis=0)
     counts = check(mesh, x, 0.01, 0.005, device=device)
@@ -150,8 +146,7 @@ def test_lists_grow_and_repeat_their_bits(device):
         wp.capture_launch(capture.graph)
         lists.append(lists_of(found))
         assert_same(lists[0], lists[-1])
-    assert not found.overflowed and (lists[0][0] == counts).all()
-    assert rows(full) <= rows(lists[0][2])
+    assert not found.overflowed and (lists[0][0] == counts).all() and rows(full) <= rows(lists[0][2])
 
 
 def test_lists_do_not_depend_on_the_threads_of_an_element(device):
@@ -260,10 +255,8 @@ MOVES = {
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", MOVES)
 def test_moves_stop_at_pairs_that_were_far_apart(name, dtype, device):
-    """Two sheets of 3 × 3 vertices, 0.2 m apart, keep a tenth of it; another sheet, and a copy without moves, change nothing.
-
-    The first is smaller and below the inside of a triangle of the second, so that no edges cross.
-    """
+    """Two sheets of 3 × 3 vertices, 0.2 m apart, keep a tenth; another sheet, and a copy without moves, change nothing."""
+    # The first is smaller and below the inside of a triangle of the second, so that no edges cross.
     gap, few = 0.2, wc.Mesh.grid(3, 3, size=0.02)
     starts, scales = np.array([[0.004, 0.0, 0.001], [0.0, gap, 0.0], [5.0, 0.0, 0.0]]), np.array([0.1, 1.0, 1.0])
     points = few.points * scales[:, None, None] + starts[:, None]

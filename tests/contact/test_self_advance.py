@@ -66,8 +66,7 @@ COUNT, GAP = 600, 5e-6
 def parallel_edges(longest):
     """Edges at angles of 1e-8 to 1e-2 rad (COUNT, 4, 3)."""
     rng = np.random.default_rng(3)
-    q = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
-    angle = 10.0 ** rng.uniform(-8.0, -2.0, (COUNT, 1))
+    q, angle = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0], 10.0 ** rng.uniform(-8.0, -2.0, (COUNT, 1))
     first, second, gap = q[:, 0], np.cos(angle) * q[:, 0] + np.sin(angle) * q[:, 1], GAP * q[:, 2]
     ends = longest * rng.uniform(0.1, 1.0, (4, COUNT, 1))
     return np.stack([-ends[0] * first, ends[1] * first, -ends[2] * second - gap, ends[3] * second - gap], axis=1)
@@ -76,8 +75,7 @@ def parallel_edges(longest):
 def thin_triangles(angle):
     """Vertices above the inside of triangles 10 m long with such an angle (COUNT, 4, 3)."""
     rng = np.random.default_rng(4)
-    q = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0]
-    length = rng.uniform(5.0, 10.0, (2, COUNT, 1))
+    q, length = np.linalg.qr(rng.normal(size=(COUNT, 3, 3)))[0], rng.uniform(5.0, 10.0, (2, COUNT, 1))
     b, c = length[0] * q[:, 0], length[1] * (np.cos(angle) * q[:, 0] + np.sin(angle) * q[:, 1])
     w = 0.05 + 0.85 * rng.dirichlet([1.0, 1.0, 1.0], COUNT)
     w /= w.sum(axis=1)[:, None]

@@ -63,8 +63,7 @@ def test_record_of_pairs(dtype, device):
     assert total.pairs >= found.pairs["pairs listed"].max()
     assert total.lists == found.pairs["new lists"].sum() >= (2 if device == "cpu" else 1)  # there sweeps end elsewhere
     assert 1.0 - total.kept == pytest.approx(found.cut) and found.cuts.mean() == pytest.approx(6 / 7 * found.cut)
-    assert found.pairs["moves kept"] == pytest.approx(1.0 - found.cuts)
-    assert plain.self_contact == total
+    assert found.pairs["moves kept"] == pytest.approx(1.0 - found.cuts) and plain.self_contact == total
 
 
 def test_moves_that_the_filter_cuts(device):
@@ -95,11 +94,8 @@ def test_none_of_it_without_self_contact(device):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_frames_too_coarse_for_the_gap_are_named(dtype, device, tmp_path):
-    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on.
-
-    Frames in memory have the precision of the run, those in a file are float32.
-    """
-    # They are too soft to push one another apart in the meantime.
+    """Sheets 6 µm apart that fly off along x at 100 m/s: beyond x = 16 m this is less than 4 · 2⁻¹⁹ m, from frame 4 on."""
+    # They are too soft to push one another apart. Frames in memory have the precision of the run, those in a file are float32.
     scene = sheets(gap=6e-6, turn=0.0, stiffness=1e-6, velocities=np.tile([100.0, 0.0, 0.0], (32, 1)))
 
     def report(frames, output=None):
@@ -170,8 +166,7 @@ def test_the_filter_leaves_the_least_gap(far, dtype, device):
     scene = sheets(stiffness=1e-3, gravity=np.array([0.0, -9.81, 0.0]), pins=np.arange(16))
     scene = replace(scene, positions=scene.positions + far, mesh=wc.Mesh(scene.mesh.points + far, scene.mesh.triangles))
     found = wc.simulate(scene, wc.XPBD(substeps=8, iterations=4), device=device, dtype=dtype, frames=8, record="pairs")
-    assert found.self_contact.too_near is None
-    assert found.self_contact.least_gap >= least
+    assert found.self_contact.too_near is None and found.self_contact.least_gap >= least
     assert found.pairs["least gap"][-1] < 4.0 * least
 
 
@@ -262,8 +257,7 @@ def test_work_of_pins_where_a_step_makes_room(device):
         if room:
             stepper.pairs.grow_to(room)
             stepper.record_again()
-        history = History(stepper, model, ("energies",))
-        before = len(stepper.pairs.pairs.stencils)
+        history, before = History(stepper, model, ("energies",)), len(stepper.pairs.pairs.stencils)
         for _ in range(3):
             history.frame()
             history.keep(np.ones(1, dtype=bool))

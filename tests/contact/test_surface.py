@@ -8,15 +8,14 @@ import trimesh
 import warp as wp
 
 import warpcloth as wc
-from support.contacts import energy, gradient, slope_of
-from support.layers import after_frames, cloth, ground, positions, stack
+from support.contacts import energy, gradient, hessian_times, slope_of
+from support.layers import cloth, ground, positions, stack
 from support.pairs import between_edges, detect, from_triangle
+from support.steps import after_frames
 from warpcloth.contact.proximity import MAX_MOVE, Proximity
 from warpcloth.contact.surface import ContactSurface
-from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.contact.obstacles import CLOTH, OBSTACLE
 from warpcloth.kernels.contact.pair_potential import CLOSE
-from warpcloth.kernels.term import HessianPolicy
 
 R = 3e-3
 
@@ -47,17 +46,14 @@ def test_forces_and_matrix_are_derivatives_of_the_energy(cells, gap, device):
         step[i, axis] = 1.0
         # Third derivatives of φ are of the order of kA/r², and U is rounded.
         assert found[i, axis] == pytest.approx(slope_of(energy, stepper.pairs, x, step, eta), abs=1e-6 * np.abs(found).max())
-    model, product, near = stepper.model, stepper.model.vectors(), 1e-6 * gap * R
-    hessian = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=stepper.pairs.forces.terms)
-    hessian.prepare()
+    near = 1e-6 * gap * R
     for _ in range(3):
         p = rng.normal(size=x.shape)
         expected = slope_of(gradient, stepper.pairs, x, p, near)
-        hessian.assemble(model.array(x, model.vec3), 0.0)
-        hessian.multiply(model.array(p, model.vec3), product, wp.ones(1, dtype=wp.int32, device=device))
+        found, hessian = hessian_times(stepper.pairs, x, p)
         # The error is of (p near/d)², and of x, rounded, times the matrix over near.
         rounding = np.finfo(float).eps * np.abs(hessian.values.numpy()).max() * np.abs(x).max() / near
-        assert product.numpy() == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding)
+        assert found == pytest.approx(expected, abs=1e-7 * np.abs(expected).max() + rounding)
 
 
 @pytest.mark.parametrize("cells", (2, 9, 40))
@@ -107,8 +103,7 @@ def test_a_tip_stays_below_a_triangle(device):
     stepper = after_frames(scene, wc.Newton(substeps=2), dtype="float64", device=device)
     for a, b, c in positions(stepper, 4):
         normal = np.cross(b - a, c - a)
-        assert abs(normal @ a) / np.linalg.norm(normal) < 0.05
-        assert normal @ -a * np.sign(normal[1]) < 0.0
+        assert abs(normal @ a) / np.linalg.norm(normal) < 0.05 and normal @ -a * np.sign(normal[1]) < 0.0
 
 
 def test_pins_may_be_inside_a_mesh():
@@ -200,15 +195,12 @@ def test_a_copy_that_needs_more_rounds_changes_no_other(device):
 
 @pytest.mark.parametrize("itself", [False, True])
 def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
-    """Triangles of two sizes, which are in several levels of the grid, two copies, and pins, which meet no mesh.
-
-    None is missing after cloth and meshes have moved as far as a list is kept, and cloth has then moved by a round.
-    """
+    """Triangles of two sizes, which are in several levels of the grid, two copies, and pins, which meet no mesh."""
+    # None is missing after cloth and meshes have moved as far as a list is kept, and cloth has then moved by a round.
     scene = sheet([ground(0.2, 14), ground(0.4, position=(0.0, -0.02, 0.0))], pins=[0, 1, 6, 7])
     model, skin = scene.build(copies=2, dtype="float64", device=device), 0.01
     surface = ContactSurface(model, itself)
-    x = surface.of_model(surface.rest)
-    rng = np.random.default_rng(0)
+    x, rng = surface.of_model(surface.rest), np.random.default_rng(0)
     x[: model.count] += rng.normal(scale=0.02, size=(model.count, 3))
     found = Proximity(surface, R, skin, R)
     stencils = np.concatenate(detect(found, x))
@@ -238,8 +230,7 @@ def test_lists_have_all_pairs_of_cloth_and_meshes_and_no_others(itself, device):
         found = rng.normal(size=(count, 3))
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
-    assert len(near(x, skin)) > 1000
-    assert sorted(listed) == sorted(near(x, skin))
+    assert len(near(x, skin)) > 1000 and sorted(listed) == sorted(near(x, skin))
     x += rng.uniform(-2.0, 2.0, 3)
     x[model.count :] += 0.02 * skin * ways(len(x) - model.count)
     x[: model.count] += (found.kept - 0.12) * skin * ways(model.count)
@@ -265,33 +256,22 @@ def test_the_gap_of_edges_is_reported_where_they_do_not_act(start, device):
 def test_a_copy_without_pairs_does_not_follow_what_another_has(solver, device):
     """Two sheets fall on a mesh, one as fast that it has pairs first; the other moves as alone, to the bit."""
     grid, mesh = wc.Mesh.grid(8, 8, size=0.3), wc.Mesh.grid(5, 5, size=0.5)
-    positions = grid.points - grid.points.mean(axis=0) + [0.0, 0.03, 0.0]
-    scene = wc.Scene(
-        grid,
-        positions=positions,
-        density=0.15,
-        terms=[wc.Spring(stiffness=300.0)],
-        fps=24.0,
-        contact=wc.Contact(distance=4e-3, stiffness=1e4),
-        colliders=[wc.MeshCollider(mesh.points - mesh.points.mean(axis=0), mesh.triangles)],
-    )
+    start = grid.points - grid.points.mean(axis=0) + [0.0, 0.03, 0.0]
+    colliders = [wc.MeshCollider(mesh.points - mesh.points.mean(axis=0), mesh.triangles)]
+    fields = {"colliders": colliders, "contact": wc.Contact(distance=4e-3, stiffness=1e4), "fps": 24.0}
+    scene = cloth(grid, terms=[wc.Spring(stiffness=300.0)], positions=start, **fields)
     falls = np.array([[0.0, -3.0, 0.0], [1.0, -8.0, 0.0]])[:, None]
-    velocities = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls
-    found = []
+    velocities, found = 0.2 * np.random.default_rng(0).normal(size=(2, 64, 3)) + falls, []
     for copies in (1, 2):
-        stepper = solver.bind(scene.build(copies=copies, dtype="float64", device=device))
+        stepper = after_frames(scene, solver, copies=copies, dtype="float64", device=device)
         stepper.reset(None, None, velocities[:copies])
-        for _ in range(2):
-            stepper.frame()
-        found.append(stepper.state.x.numpy()[:64])
+        found.append(list(positions(stepper, 2))[-1][:64])
     assert (found[0] == found[1]).all()
 
 
 def test_a_copy_that_stays_apart_does_not_walk_with_another(device):
-    """Two sheets approach each other, in one copy too slowly to meet; it moves as alone, to the bit, 100 m from the origin.
-
-    Rounding decides it: of twelve directions of one of the sheets this one alone differed where both copies walked in rounds.
-    """
+    """Two sheets approach each other, in one copy too slowly to meet; it moves as alone, to the bit, 100 m from the origin."""
+    # Rounding decides it: of twelve directions of one of the sheets this one alone differed where both copies walked in rounds.
     grid = wc.Mesh.grid(8, 8, size=0.4)
     points = grid.points - grid.points.mean(axis=0)
     turned = points @ np.linalg.qr(np.random.default_rng(6).normal(size=(3, 3)))[0]
@@ -299,8 +279,7 @@ def test_a_copy_that_stays_apart_does_not_walk_with_another(device):
     mesh = wc.Mesh(np.concatenate([points, other]) + 100.0 * np.array([1, 1, -1]), [*grid.triangles, *(grid.triangles + 64)])
     terms, contact = [wc.Spring(stiffness=200.0)], wc.SelfContact(distance=6e-3)
     scene = wc.Scene(mesh, density=0.15, terms=terms, fps=24.0, gravity=(0, 0, 0), self_contact=contact)
-    velocities = np.repeat([[0.0, 1.0, 0.0], [0.4, -1.0, 0.0]], 64, axis=0)
-    found = []
+    velocities, found = np.repeat([[0.0, 1.0, 0.0], [0.4, -1.0, 0.0]], 64, axis=0), []
     for speeds in ([0.7], [0.7, 1.0]):
         stepper = wc.XPBD(substeps=2).bind(scene.build(copies=len(speeds), device=device))
         stepper.reset(None, None, np.array(speeds)[:, None, None] * velocities)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
 from support.setups import MAIN, RUNS, SOLVERS
 from warpcloth.core.state import State
 from warpcloth.core.status import Result
@@ -14,8 +14,7 @@ MESH = wc.Mesh.grid(5, 5, pattern="alternating")
 
 def moved(offset=0.0):
     """A damped cloth out of balance, two corners led; far from the origin explicit steps keep the position residual."""
-    mesh = wc.Mesh(MESH.points + offset, MESH.triangles, grid_shape=MESH.grid_shape)
-    pins = [0, 4]
+    mesh, pins = wc.Mesh(MESH.points + offset, MESH.triangles, grid_shape=MESH.grid_shape), [0, 4]
     keyframes = mesh.points[pins][None] + np.linspace(0.0, 0.2, 5)[:, None, None] * [0.0, 0.3, 1.0]
     start = mesh.points + np.random.default_rng(0).normal(scale=0.02, size=mesh.points.shape)
     start[pins] = mesh.points[pins]
@@ -32,15 +31,12 @@ def steps(stepper, number):
 CASES = [("explicit", 300.0, "float32"), *((name, 0.0, dtype) for name, dtype in RUNS)]
 
 
-@pytest.mark.parametrize(
-    ("name", "offset", "dtype"), slow_but([("explicit", 300.0, "float32"), *((name, 0.0, "float32") for name in MAIN)], CASES)
-)
+@table("name, offset, dtype", [("explicit", 300.0, "float32"), *((name, 0.0, "float32") for name in MAIN)], CASES)
 def test_from_a_state_on_all_bits_are_the_same(name, offset, dtype, device):
     stepper = SOLVERS[name].bind(moved(offset).build(device=device, dtype=dtype))
     assert ("position residual" in stepper.state.arrays) == bool(offset)
     before = steps(stepper, 2)
-    stored = before.to_host()
-    after = steps(stepper, 3)
+    stored, after = before.to_host(), steps(stepper, 3)
     assert isinstance(before, State) and before == before.copy() and before != after
     stepper.state.assign(before)
     assert stepper.state == before and steps(stepper, 3) == after
@@ -52,10 +48,8 @@ def test_from_a_state_on_all_bits_are_the_same(name, offset, dtype, device):
 def test_states_of_a_shared_batch_go_with_the_whole(device):
     if device != "cpu":
         pytest.skip("threads are for the CPU")
-    model = moved().build(copies=3, threads=2)
-    stepper = wc.XPBD(substeps=1, iterations=2, integrator="bdf2").bind(model)
-    before = steps(stepper, 2)
-    after = steps(stepper, 2)
+    stepper = wc.XPBD(substeps=1, iterations=2, integrator="bdf2").bind(moved().build(copies=3, threads=2))
+    before, after = steps(stepper, 2), steps(stepper, 2)
     stepper.state.assign(before)
     assert stepper.state == before and steps(stepper, 2) == after
     stepper.state.from_host(before.to_host())
@@ -68,10 +62,8 @@ def test_states_of_a_shared_batch_go_with_the_whole(device):
 def test_the_state_of_a_shared_batch_says_how_its_steps_ended(device):
     if device != "cpu":
         pytest.skip("threads are for the CPU")
-    one, two = (
-        wc.Newton(substeps=1, iterations=1, tolerance=1e-12).bind(moved().build(copies=3, threads=threads))
-        for threads in (1, 2)
-    )
+    solver = wc.Newton(substeps=1, iterations=1, tolerance=1e-12)
+    one, two = (solver.bind(moved().build(copies=3, threads=threads)) for threads in (1, 2))
     of_one, of_two = steps(one, 1), steps(two, 1)
     assert of_one.results == of_two.results == two.results == [Result.ITERATIONS_USED_UP] * 3
     assert np.array_equal(of_one.residual, of_two.residual) and np.array_equal(of_two.residual, two.residual)

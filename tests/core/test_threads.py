@@ -14,9 +14,10 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.rows import slow_but
-from support.setups import SOLVERS, allocations, square
+from support.rows import table
+from support.setups import SOLVERS, allocated, square
 from support.sheets import SPRINGS, declared
+from support.steps import after_frames
 from warpcloth.cli import main
 from warpcloth.core.thread_pool import ThreadPool
 from warpcloth.lab import benchmarks
@@ -41,17 +42,14 @@ def same(steppers):
     return all(np.array_equal(a, b) for other in others for a, b in zip(expected, other, strict=True))
 
 
-@pytest.mark.parametrize("name", slow_but(("xpbd",), SOLVERS))
+@table("name", ("xpbd",), SOLVERS)
 def test_copies_shared_out_are_those_of_one_thread(name, device):
     """To the bit, of uneven shares and of more threads than copies; when some are put back, too."""
     record = replace(SOLVERS[name], substeps=2)
     scene = square(solver=record, damping=0.01, fps=300.0, pins="corners")
-    steppers = [record.bind(scene.build(device=device, copies=3, vary=VARY, threads=threads)) for threads in (1, 2, 5)]
-    places = np.tile(scene.mesh.points + 0.01, (3, 1, 1))
-    given = {"positions": None if "bdf2" in name else places}
+    given = {"positions": None if "bdf2" in name else np.tile(scene.mesh.points + 0.01, (3, 1, 1))}
+    steppers = [after_frames(scene, record, 1, 1, device=device, copies=3, vary=VARY, threads=each) for each in (1, 2, 5)]
     for stepper in steppers:
-        stepper.frame()
-        stepper.step()
         stepper.reset(np.array([True, False, True]), **given)
         stepper.step()
     assert same(steppers)
@@ -67,21 +65,16 @@ def test_copies_of_stiffness_by_element_are_those_of_one_thread(device):
     values[1] *= random.uniform(0.5, 2.0, values[1].shape)
     values[2, ::2] = 0.0
     vary = {"QuadraticBending.stiffness": values}
-    record = wc.Explicit(substeps=8, above_limit="allow")
-    steppers = [record.bind(scene.build(device=device, copies=3, vary=vary, threads=threads)) for threads in (1, 2, 3)]
-    for stepper in steppers:
-        stepper.frame()
-    assert same(steppers)
+    record, build = wc.Explicit(substeps=8, above_limit="allow"), {"device": device, "copies": 3, "vary": vary}
+    assert same([after_frames(scene, record, 1, threads=threads, **build) for threads in (1, 2, 3)])
 
 
 @pytest.mark.parametrize("name", ["explicit", "xpbd"])
 @pytest.mark.slow
 def test_threads_allocate_nothing(name, device):
     record = replace(SOLVERS[name], substeps=2)
-    stepper = record.bind(square(solver=record, damping=0.01, fps=300.0).build(device=device, copies=2, threads=2))
-    stepper.frame()
-    with wp.ScopedMemoryTracker("frames", print=False) as tracker:
-        assert allocations(tracker, lambda: [stepper.frame() for _ in range(2)]) == 0
+    stepper = after_frames(square(solver=record, damping=0.01, fps=300.0), record, 1, device=device, copies=2, threads=2)
+    assert allocated(lambda: [stepper.frame() for _ in range(2)], device) == 0
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -160,9 +153,7 @@ def test_steppers_of_one_model_have_threads_of_their_own(device):
 
 def test_threads_that_nobody_needs_end(device):
     before = threading.enumerate()
-    model = square().build(device=device, threads=2, copies=2)
-    stepper = wc.PBD(substeps=1).bind(model)
-    stepper.frame()
+    stepper = after_frames(square(), wc.PBD(substeps=1), 1, device=device, threads=2, copies=2)
     started = [thread for thread in threading.enumerate() if thread not in before]
     assert started
     del stepper
@@ -202,16 +193,14 @@ def test_debug_mode_has_one_thread(device, monkeypatch):
 
 
 def test_simulate_and_bench_take_threads(device, capsys, monkeypatch):
-    scene = square(pins="corners", fps=300.0)
-    record = wc.XPBD(substeps=2, iterations=3)
+    scene, record = square(pins="corners", fps=300.0), wc.XPBD(substeps=2, iterations=3)
     one, two = (wc.simulate(scene, record, device=device, frames=3, copies=2, threads=threads) for threads in (1, 2))
     assert np.array_equal(one.points, two.points)
     command = ["bench", "hanging", "-p", "n=5", "--solver", "explicit", "--frames", "2", "--json", "--threads", "2"]
     monkeypatch.setattr(benchmarks, "_alone", lambda asked: asked.run())  # in this process, which has the kernels
     assert main([*command, "--copies", "2"]) == 0
     (row,) = json.loads(capsys.readouterr().out)["rows"]
-    assert row["threads"] == 2 and row["launches"] > 1.0
-    assert main(command) == 2
+    assert row["threads"] == 2 and row["launches"] > 1.0 and main(command) == 2
     assert "threads is 2 with one copy; it must be 1" in capsys.readouterr().err
 
 
@@ -219,8 +208,8 @@ def test_simulate_and_bench_take_threads(device, capsys, monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*fork")
 def test_a_forked_process_has_threads_of_its_own(device):
     """Those of its parent are not there."""
-    stepper = wc.Explicit(substeps=8, above_limit="allow").bind(declared([SPRINGS]).build(device=device, copies=2, threads=2))
-    stepper.frame()
+    record = wc.Explicit(substeps=8, above_limit="allow")
+    stepper = after_frames(declared([SPRINGS]), record, 1, device=device, copies=2, threads=2)
     ours, theirs = os.pipe()  # the child's end is closed when it ends
     child = os.fork()
     if child == 0:

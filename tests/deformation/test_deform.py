@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 import warp.examples
-from pxr import Gf, Usd, UsdGeom
+from pxr import Usd, UsdGeom
 
 import warpcloth as wc
 import warpcloth.cli.deform
 from support.command_line import refused, run
+from support.continuum import turn
+from support.mesh_texts import obj
+from support.stages import artist_stage
 from support.usd_validation import validate
 from warpcloth.deformation.deform import rotation_angles
 from warpcloth.scenes import bar_twist
@@ -19,13 +22,6 @@ from warpcloth.usd import FrameSequence, read_mesh
 
 BUNNY = os.path.join(warp.examples.get_asset_directory(), "bunny.usd")
 EPS = np.finfo(np.float32).eps
-
-
-def turn(axis, angle):
-    """Rotation matrix by Rodrigues' formula, at full precision for small angles and those near π."""
-    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * cross + 2.0 * np.sin(angle / 2.0) ** 2 * cross @ cross
 
 
 def bar(angle=60.0, frames=5, cells=2):
@@ -95,28 +91,12 @@ def test_a_net_is_deformed_with_its_curves(tmp_path, device):
 
 def test_a_scene_from_a_stage_gives_a_layer_over_it(tmp_path, device):
     """Where a scene starts does not count; its keyframes do."""
-    stage = Usd.Stage.CreateNew(str(tmp_path / "artist.usda"))
-    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
-    UsdGeom.SetStageUpAxis(stage, "Z")
-    stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/Set").GetPrim())
-    grid = wc.Mesh.grid(4, 4)
-    sheet = UsdGeom.Mesh.Define(stage, "/Set/Sheet")
-    sheet.CreatePointsAttr([Gf.Vec3f(*map(float, 100 * point)) for point in grid.points])
-    sheet.CreateFaceVertexCountsAttr([3] * len(grid.triangles))
-    sheet.CreateFaceVertexIndicesAttr(grid.triangles.ravel().tolist())
-    sheet.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(sheet.GetPointsAttr().Get()))
-    stage.Save()
+    artist_stage(tmp_path / "artist.usda", wc.Mesh.grid(4, 4))
     surroundings = wc.usd.read_stage_mesh(tmp_path / "artist.usda")
     lifted = surroundings.mesh.points + np.array([0.0, 0.5, 0.0])
     keyframes = lifted[:4] + np.array([0.0, 0.1, 0.0]) * np.arange(3)[:, None, None]
-    scene = wc.Scene(
-        surroundings.mesh,
-        density=1.0,
-        positions=lifted,
-        pins=wc.Pins([0, 1, 2, 3], keyframes),
-        stage=surroundings,
-        duration=0.1,
-    )
+    pins = wc.Pins([0, 1, 2, 3], keyframes)
+    scene = wc.Scene(surroundings.mesh, density=1.0, positions=lifted, pins=pins, stage=surroundings, duration=0.1)
     path = str(tmp_path / "out.usda")
     found = wc.deform(scene.mesh, scene.pins, fps=scene.fps, stage=scene.stage, output=path, device=device)
     np.testing.assert_allclose(found.points[:, :4], keyframes, atol=1e-6)
@@ -152,73 +132,52 @@ def two_bars():
 MESHES = {"bar.obj": bar()[0], "two.obj": two_bars()}
 MOVED = "--move x>0.9 --translate 0.1 0 0"
 
-# argv after deform, with {} for a folder of MESHES, and a part of the line that it gives.
+# argv after deform {}/bar.obj -o {}/o.usdc, with {} for a folder of MESHES, and a part of the line that it gives.
+OF_BAR = [
+    ("", "nothing moves; give --move SELECTION and after it --rotate or --translate"),
+    ("--fix x<0.1", "nothing moves; give --move SELECTION"),
+    ("--move x>0.9 --fix x<0.1", "--move 'x>0.9' does not say how; --rotate or --translate must follow"),
+    ("--rotate 90 x --move x>0.9", "--rotate stands before any --move; it says how the --move before it"),
+    ("--translate 0 0 1", "--translate stands before any --move"),
+    (f"{MOVED} --translate 0 0 1", "--move 'x>0.9' has --translate twice; each may follow it once"),
+    ("--move x>0.9 --rotate 90", "--rotate 90: it takes DEGREES AXIS, or DEGREES AXIS CX CY CZ"),
+    ("--move x>0.9 --rotate 90 x 1 2", "--rotate 90 x 1 2: it takes DEGREES AXIS, or"),
+    ("--move x>0.9 --rotate 90 w", "the AXIS of --rotate is 'w'; it must be x, y, z or a vector"),
+    ("--move x>0.9 --rotate 720 x --frames 4", "turns by 180° a frame, which must be less than 180°; give --frames 5"),
+    ("--move x>0.9 --translate 1e39 0 0", "cannot be written: a file holds float32"),
+    ("--move x>0.9 --translate 1 0 0 --fps 1e300", "velocities of pins.keyframes[0, "),
+    ("--move x>0.9 --translate 1 0 0 --tolerance -1", "tolerance is -1.0; it must be a number of 0 or more"),
+    ("--move x>0.9 --rotate 90 0,0,0", "AXIS of --rotate is '0,0,0'; it must be x, y, z or a vector such"),
+    ("--move x>0.9 --rotate 90 1,0", "AXIS of --rotate is '1,0'; it must be x, y, z or a vector such as"),
+    ("--move x>0.9 --rotate nan x", "DEGREES of --rotate is 'nan'; it must be a number"),
+    ("--move x>0.9 --translate 0 -inf 0", "argument --translate: expected 3 arguments"),
+    ("--move x>0.9 --translate 0 inf 0", "--translate is 'inf'; it must be finite"),
+    ("--move x>0.9 --translate 1 2", "argument --translate: expected 3 arguments"),
+    (f"--fix x>5 {MOVED}", "--fix 'x>5' names no vertex; the mesh reaches from (0, -0.1, -0.1) to (1,"),
+    ("--move x>5 --translate 1 0 0", "--move 'x>5' names no vertex"),
+    (f"--fix x>0.7 {MOVED}", "--move 'x>0.9' and --fix 'x>0.7' both name vertex "),
+    (f"{MOVED} --move all --rotate 9 x", "--move 'all' and --move 'x>0.9' both name vertex "),
+    (f"--fix x=0 {MOVED}", "selection 'x=0', column 2"),
+    (f"--fix boundary {MOVED}", "--fix 'boundary' names no vertex"),
+    (f"{MOVED} --frames 0", "frames is 0; it must be a whole number of 1 or more"),
+    (f"{MOVED} --fps 0", "fps is 0.0; it must be a number above 0"),
+    (f"{MOVED} --fps nan", "fps is nan; it must be a number above 0"),
+    (f"{MOVED} --iterations -1", "iterations is -1; it must be a whole number of 0 or more"),
+    (f"{MOVED} --tolerance nan", "tolerance is nan; it must be a number of 0 or more"),
+    (f"{MOVED} --weights magic", "invalid choice: 'magic'"),
+    (f"{MOVED} --energy magic", "invalid choice: 'magic'"),
+    (f"{MOVED} --device gpu", "device is 'gpu'; on this machine there are cpu"),
+    (f"{MOVED} -p angle=3", "-p is given, and {}/bar.obj is a mesh and has no parameters; leave it out"),
+]
+# And after deform alone.
 WRONG_USES = [
+    *((f"{{}}/bar.obj -o {{}}/o.usdc {argv}", fragment) for argv, fragment in OF_BAR),
     ("{}/bar.obj", "the following arguments are required: -o/--output; see warpcloth deform --help"),
     ("{}/none.obj -o {}/o.usdc --move x>0 --translate 1 0 0", "none.obj"),
-    ("{}/bar.obj -o {}/o.usdc", "nothing moves; give --move SELECTION and after it --rotate or --translate"),
-    ("{}/bar.obj -o {}/o.usdc --fix x<0.1", "nothing moves; give --move SELECTION"),
-    (
-        "{}/bar.obj -o {}/o.usdc --move x>0.9 --fix x<0.1",
-        "--move 'x>0.9' does not say how; --rotate or --translate must follow",
-    ),
-    (
-        "{}/bar.obj -o {}/o.usdc --rotate 90 x --move x>0.9",
-        "--rotate stands before any --move; it says how the --move before it",
-    ),
-    ("{}/bar.obj -o {}/o.usdc --translate 0 0 1", "--translate stands before any --move"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --translate 0 0 1", "--move 'x>0.9' has --translate twice; each may follow it once"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90", "--rotate 90: it takes DEGREES AXIS, or DEGREES AXIS CX CY CZ"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 x 1 2", "--rotate 90 x 1 2: it takes DEGREES AXIS, or"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 w", "the AXIS of --rotate is 'w'; it must be x, y, z or a vector"),
-    (
-        "{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 720 x --frames 4",
-        "turns by 180° a frame, which must be less than 180°; give --frames 5",
-    ),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1e39 0 0", "cannot be written: a file holds float32"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1 0 0 --fps 1e300", "velocities of pins.keyframes[0, "),
-    (
-        "{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1 0 0 --tolerance -1",
-        "tolerance is -1.0; it must be a number of 0 or more",
-    ),
-    (
-        "{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 0,0,0",
-        "AXIS of --rotate is '0,0,0'; it must be x, y, z or a vector such",
-    ),
-    (
-        "{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate 90 1,0",
-        "AXIS of --rotate is '1,0'; it must be x, y, z or a vector such as",
-    ),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --rotate nan x", "DEGREES of --rotate is 'nan'; it must be a number"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 0 -inf 0", "argument --translate: expected 3 arguments"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 0 inf 0", "--translate is 'inf'; it must be finite"),
-    ("{}/bar.obj -o {}/o.usdc --move x>0.9 --translate 1 2", "argument --translate: expected 3 arguments"),
-    (
-        f"{{}}/bar.obj -o {{}}/o.usdc --fix x>5 {MOVED}",
-        "--fix 'x>5' names no vertex; the mesh reaches from (0, -0.1, -0.1) to (1,",
-    ),
-    ("{}/bar.obj -o {}/o.usdc --move x>5 --translate 1 0 0", "--move 'x>5' names no vertex"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc --fix x>0.7 {MOVED}", "--move 'x>0.9' and --fix 'x>0.7' both name vertex "),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --move all --rotate 9 x", "--move 'all' and --move 'x>0.9' both name vertex "),
-    (f"{{}}/bar.obj -o {{}}/o.usdc --fix x=0 {MOVED}", "selection 'x=0', column 2"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc --fix boundary {MOVED}", "--fix 'boundary' names no vertex"),
     ("{}/two.obj -o {}/o.usdc --move z<0.5 --translate 1 0 0", "handles leave 1 of the 2 parts of the mesh without one"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --frames 0", "frames is 0; it must be a whole number of 1 or more"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --fps 0", "fps is 0.0; it must be a number above 0"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --fps nan", "fps is nan; it must be a number above 0"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --iterations -1", "iterations is -1; it must be a whole number of 0 or more"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --tolerance nan", "tolerance is nan; it must be a number of 0 or more"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --weights magic", "invalid choice: 'magic'"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --energy magic", "invalid choice: 'magic'"),
-    (f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} --device gpu", "device is 'gpu'; on this machine there are cpu"),
-    (
-        f"{{}}/bar.obj -o {{}}/o.usdc {MOVED} -p angle=3",
-        "-p is given, and {}/bar.obj is a mesh and has no parameters; leave it out",
-    ),
     (f"{{}}/bar.obj -o {{}}/no/o.usdc {MOVED}", "no does not exist"),
     (f"{{}}/bar.obj -o {{}}/o.obj {MOVED}", "must end with one of .usd, .usda, .usdc, .usdz"),
     (f"{BUNNY} -o {{}}/o.usdc --prim /Ham {MOVED}", "bunny.usd, prim /Ham: there is no such prim, only /root/bunny"),
-    # scenes
     ("hanging -o {}/o.usdc", "the pins of hanging do not move; give a scene whose pins have keyframes, or a mesh and --move"),
     ("hangin -o {}/o.usdc --fix x<0", "there is no scene 'hangin'; known by name are "),
     (
@@ -235,10 +194,7 @@ WRONG_USES = [
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     for name, mesh in MESHES.items():
-        lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in mesh.points] + [
-            f"f {a} {b} {c}" for a, b, c in mesh.triangles + 1
-        ]
-        (folder / name).write_text("\n".join(lines))
+        (folder / name).write_text(obj(mesh.points, mesh.triangles))
     return folder
 
 
@@ -264,16 +220,13 @@ def test_moves_turn_first_and_shift_then(folder, tmp_path, capfd):
         part = frame / 96
         expected = (mesh.points[end] - [0, 0.5, 0]) @ turn([1, 0, 0], 4 * np.pi * part).T + [0, 0.5 - 0.1 * part, 0.2 * part]
         np.testing.assert_allclose(points[frame, end], expected, atol=4 * EPS)
-    np.testing.assert_allclose(
-        points[-1, middle], (mesh.points[middle] - [0.5, 0, 0]) @ turn([0, 0, 1], np.pi / 360).T + [0.5, 0, 0], atol=4 * EPS
-    )
-    np.testing.assert_allclose(
-        points[:, mesh.select("x < 0.1")], mesh.points[None, mesh.select("x < 0.1")].repeat(97, 0), atol=EPS
-    )
-    assert facts["handles"] == len(end) + len(middle) + len(mesh.select("x < 0.1")) and facts["vertices"] == len(mesh.points)
+    turned = (mesh.points[middle] - [0.5, 0, 0]) @ turn([0, 0, 1], np.pi / 360).T + [0.5, 0, 0]
+    np.testing.assert_allclose(points[-1, middle], turned, atol=4 * EPS)
+    held = mesh.select("x < 0.1")
+    np.testing.assert_allclose(points[:, held], mesh.points[None, held].repeat(97, 0), atol=EPS)
+    assert facts["handles"] == len(end) + len(middle) + len(held) and facts["vertices"] == len(mesh.points)
     assert facts["file"] == str(output) and facts["frames"] == 96 and facts["most_iterations"] >= facts["median_iterations"] > 0
-    assert 0.0 <= facts["largest_angle"] <= 180.0 and facts["last_energy"] > 0.0
-    assert validate(output) == []
+    assert 0.0 <= facts["largest_angle"] <= 180.0 and facts["last_energy"] > 0.0 and validate(output) == []
 
 
 def test_a_stage_is_deformed_by_a_layer_over_it(tmp_path, capfd):
@@ -286,9 +239,8 @@ def test_a_stage_is_deformed_by_a_layer_over_it(tmp_path, capfd):
     assert lines["frames"].strip().startswith("2, ") and "of 6102 vertices" in lines["handles"]
     assert lines["iterations"].strip() == "3 a frame (median), at most 3" and lines["file"].strip() == str(output)
     assert "largest angle " in out and "° from rest" in out and " m² in the last frame" in lines["energy"]
-    assert (
-        Usd.Stage.Open(str(output)).GetPrimAtPath("/root/bunny").GetAttribute("primvars:rotationAngle").GetNumTimeSamples() == 3
-    )
+    stage = Usd.Stage.Open(str(output))
+    assert stage.GetPrimAtPath("/root/bunny").GetAttribute("primvars:rotationAngle").GetNumTimeSamples() == 3
     np.testing.assert_array_equal(read_mesh(output).triangles, read_mesh(BUNNY).triangles)
     assert validate(output, BUNNY) == []
 
@@ -309,20 +261,7 @@ def test_a_scene_is_deformed_by_its_keyframes(tmp_path, capfd, frames):
 
 
 def test_a_refused_command_leaves_an_earlier_result(folder, tmp_path, capfd):
-    argv = [
-        "deform",
-        folder / "bar.obj",
-        "--fix",
-        "x<0.1",
-        "--move",
-        "x>0.9",
-        "--translate",
-        "0.1",
-        0,
-        0,
-        "-o",
-        tmp_path / "out.usdc",
-    ]
+    argv = ["deform", folder / "bar.obj", "--fix", "x<0.1", *MOVED.split(), "-o", tmp_path / "out.usdc"]
     assert run(capfd, *argv)[0] == 0
     refused(capfd, [*argv, "--fps", "1e300"], "cannot be written")
     assert len(FrameSequence(tmp_path / "out.usdc")) == 25
@@ -330,19 +269,8 @@ def test_a_refused_command_leaves_an_earlier_result(folder, tmp_path, capfd):
 
 @pytest.mark.parametrize("axis", ["0,0,2", "0,0,1e200", "0,0,1e-200"])
 def test_the_length_of_an_axis_does_not_matter(axis, folder, tmp_path, capfd):
-    common = [
-        "deform",
-        folder / "bar.obj",
-        "--fix",
-        "x<0.1",
-        "--move",
-        "x>0.9",
-        "--frames",
-        3,
-        "--energy",
-        "spokes_and_rims",
-        "--json",
-    ]
+    options = "--fix x<0.1 --move x>0.9 --frames 3 --energy spokes_and_rims --json".split()
+    common = ["deform", folder / "bar.obj", *options]
     code, out, err = run(capfd, *common, "--rotate", 90, axis, "-o", tmp_path / "one.usdc")
     assert (code, err) == (0, "") and json.loads(out)["energy"] == "spokes_and_rims"
     run(capfd, *common, "--rotate", 90, "z", "-o", tmp_path / "other.usdc")

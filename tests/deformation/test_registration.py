@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.continuum import corner_normals
+from support.mesh_texts import obj
 from warpcloth.cli import main
 from warpcloth.lab.scans import scan, write_capture
 from warpcloth.mesh.mesh import Surface
@@ -18,34 +20,23 @@ def bent(frames=4):
     """The sheet, bent about z to cylinders of growing curvature, which is isometric, and moved, (frames, n, 3)."""
     found = []
     for k in range(frames):
-        angle = 0.4 * (k + 1) * (TEMPLATE.points[:, 0] - 0.5)
-        radius = 1.0 / (0.4 * (k + 1))
+        angle, radius = 0.4 * (k + 1) * (TEMPLATE.points[:, 0] - 0.5), 1.0 / (0.4 * (k + 1))
         y = radius * (1.0 - np.cos(angle))
         found.append(np.stack([0.5 + radius * np.sin(angle) + 0.03 * k, y, TEMPLATE.points[:, 2]], axis=1))
     return np.array(found)
 
 
-def normals(x):
-    a, b, c = x[TEMPLATE.triangles].transpose(1, 0, 2)
-    sums = np.zeros_like(x)
-    for corner in TEMPLATE.triangles.T:
-        np.add.at(sums, corner, np.cross(b - a, c - a))
-    return sums / np.linalg.norm(sums, axis=1)[:, None]
-
-
 def errors(found, true):
     """RMS error along the normal and along the surface [m]."""
-    apart, normal = found - true, np.array([normals(x) for x in true])
+    apart, normal = found - true, np.array([corner_normals(TEMPLATE, x) for x in true])
     along = np.einsum("fki,fki->fk", apart, normal)
     return np.sqrt(np.mean(along**2)), np.sqrt(np.mean(np.sum(apart**2, axis=2) - along**2))
 
 
 @pytest.mark.parametrize(("noise", "pinned"), [(0.0, False), (1e-3, True), (1e-3, False)])
 def test_it_follows_the_vertices_of_a_known_motion(noise, pinned):
-    """Along the normal within the sagitta of an edge, h²κ/8 = 3 mm, and the noise; along the surface within 1/40 of an edge.
-
-    It does so without pins, because the outline is seen.
-    """
+    """Along the normal within the sagitta of an edge, h²κ/8 = 3 mm, and the noise; along the surface within 1/40 of an edge."""
+    # It does so without pins, because the outline is seen.
     true = bent()
     seen = scan(TEMPLATE, true, 1 / 24, SPACING, noise, 0.1, 0.1)
     edge = np.flatnonzero(TEMPLATE.points[:, 0] == 0.0)
@@ -64,16 +55,14 @@ def test_it_follows_the_vertices_of_a_known_motion(noise, pinned):
 
 @pytest.mark.parametrize(("frames", "whole"), [(1, True), (4, True), (4, False)])
 def test_folds_are_not_cut(frames, whole):
-    """A pleated strip, whose edges have their full length and turn at each crease, seen at its own vertices.
-
-    It starts with the angle of 1 rad at creases. Or it starts flat and reaches that in 4 equal steps of δ, of which the first
-    two may lack three columns. At its true positions distances and strain are 0, so that the energy is that of cells,
-    0.12 Σ_c Σ w ‖e − ê‖². Of its edges ê, 0.9 are those of the last frame, off by 2 sin(δ/4) h for each of the two edges of a
-    cell along the strip, of length h, and 0.1 are those at rest with the rotation of the middle, off by 2 sin(¼) h. With
-    w = d/h inside and half of it on the border, of d the distance of rows, all vertices add less than
-    0.12 · 2 (0.9 · 2 sin(δ/4) + 0.1 · 2 sin(¼))² · area.
-    The minimum lies below, of the energy of triangles, 2 Σ area Σ (σ − 1)², and the mean squared distance over α.
-    """
+    """A pleated strip, whose edges have their full length and turn at each crease, seen at its own vertices."""
+    # It starts with the angle of 1 rad at creases. Or it starts flat and reaches that in 4 equal steps of δ, of which the first
+    # two may lack three columns. At its true positions distances and strain are 0, so that the energy is that of cells, 0.12
+    # Σ_c Σ w ‖e − ê‖². Of its edges ê, 0.9 are those of the last frame, off by 2 sin(δ/4) h for each of the two edges of a cell
+    # along the strip, of length h, and 0.1 are those at rest with the rotation of the middle, off by 2 sin(¼) h. With w = d/h
+    # inside and half of it on the border, of d the distance of rows, all vertices add less than 0.12 · 2 (0.9 · 2 sin(δ/4) +
+    # 0.1 · 2 sin(¼))² · area. The minimum lies below, of the energy of triangles, 2 Σ area Σ (σ − 1)², and the mean squared
+    # distance over α.
     count, alpha = 12, 1e-3
     mesh = wc.Mesh.grid(count + 1, 5, size=(1.0, 0.4))
     column = np.rint(count * mesh.points[:, 0]).astype(int)
@@ -98,12 +87,10 @@ def test_folds_are_not_cut(frames, whole):
 
 def test_what_holes_hide_is_not_observed():
     """Vertices over a hole in the middle follow their neighbours, and are said not to be observed."""
-    true = bent(1)
-    middle = (np.abs(TEMPLATE.points - 0.5)[:, [0, 2]] < 0.2).all(axis=1)
+    true, middle = bent(1), (np.abs(TEMPLATE.points - 0.5)[:, [0, 2]] < 0.2).all(axis=1)
     kept = ~middle[TEMPLATE.triangles].any(axis=1)
     seen = wc.as_capture([Surface(true[0], TEMPLATE.triangles[kept])], dt=1.0)
-    found = wc.resample(seen, TEMPLATE)
-    inside = np.setdiff1d(np.arange(len(true[0])), TEMPLATE.boundary)
+    found, inside = wc.resample(seen, TEMPLATE), np.setdiff1d(np.arange(len(true[0])), TEMPLATE.boundary)
     assert found.distances[0][middle].min() < 0.13  # points within 0.141 m count
     assert not found.observed[0][middle].any() and found.observed[0][inside].mean() > 0.5
     assert np.abs(found.points[0] - true[0])[middle].max() < 5e-3
@@ -125,17 +112,14 @@ def test_missing_frames_are_interpolated_and_files_are_written(tmp_path, capsys)
     true = bent()
     write_capture(scan(TEMPLATE, true, 1 / 24, SPACING), tmp_path / "seen", scale=1e-3)
     (tmp_path / "seen" / "seen_0002.ply").unlink()
-    lines = [f"v {x:.17g} {y:.17g} {z:.17g}" for x, y, z in true[0]]
-    lines += [f"f {i + 1} {j + 1} {k + 1}" for i, j, k in TEMPLATE.triangles]
-    (tmp_path / "first.obj").write_text("\n".join(lines) + "\n")
+    (tmp_path / "first.obj").write_text(obj(true[0], TEMPLATE.triangles))
     words = ["resample", str(tmp_path / "seen"), "--onto", str(tmp_path / "first.obj"), "-o", str(tmp_path / "x.usdc")]
     assert main([*words, "--fps", "24", "--scale", "0.001", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["frames"] == 4 and facts["missing"] == [2] and facts["not_converged"] == 0 and facts["rms"] < 1.5e-3
     sequence = wc.open_sequence(tmp_path / "x.usdc")
-    assert np.allclose(sequence.times, np.arange(4) / 24) and np.allclose(
-        sequence[2], 0.5 * (sequence[1] + sequence[3]), atol=1e-6
-    )
+    assert np.allclose(sequence.times, np.arange(4) / 24)
+    assert np.allclose(sequence[2], 0.5 * (sequence[1] + sequence[3]), atol=1e-6)
     distances = np.asarray(wc.usd.FrameSequence(tmp_path / "x.usdc", attribute="primvars:captureDistance"))
     assert (distances[2] == -1.0).all() and 0.0 <= distances[[0, 1, 3]].min() and distances.max() < 0.02
     for wrong, sentence in (  # wrong outputs with nothing to read: they are refused before the capture

@@ -6,7 +6,7 @@ import scipy.sparse
 
 import warpcloth as wc
 from support.continuum import flat
-from support.steps import after_one_step, swinging
+from support.steps import after_steps, swinging
 from warpcloth.core.constant_matrix import constant_matrices
 from warpcloth.core.status import Result
 from warpcloth.numerics import constant_multigrid
@@ -47,10 +47,8 @@ def operators(model, solver):
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_cycles_are_a_symmetric_bound_of_the_inverse(mesh, small, device):
-    """(1 − ε)A⁻¹ ≤ B ≤ A⁻¹, so B A has eigenvalues from 1 − ε to 1; ε is of power iteration, from below. Pins keep b.
-
-    The condition number of A is 1e7, so that rounding is up to 2e-9.
-    """
+    """(1 − ε)A⁻¹ ≤ B ≤ A⁻¹, so B A has eigenvalues from 1 − ε to 1; ε is of power iteration, from below. Pins keep b."""
+    # The condition number of A is 1e7, so that rounding is up to 2e-9.
     model = model_of(mesh, device)
     matrices = constant_matrices(model, 100.0)
     solver = CopyCycles(model, matrices)
@@ -74,8 +72,7 @@ def test_a_copy_does_not_depend_on_others(small, device):
         solver, x = CopyCycles(model, constant_matrices(model, 100.0)), model.vectors()
         solver.solve(model.array(np.tile(b, (model.copies, 1)), model.vec3), x)
         alone.append((solver.cycles, x.numpy()))
-    assert alone[0][0] != alone[1][0]
-    assert (alone[3][1] == np.concatenate([x for _, x in alone[:3]])).all()
+    assert alone[0][0] != alone[1][0] and (alone[3][1] == np.concatenate([x for _, x in alone[:3]])).all()
     assert len(solver._matrix.values) == 2
 
 
@@ -110,13 +107,11 @@ def test_locked_coordinates(small, device):
 def test_iterations_end_where_those_with_factors_do(module, solver, small, device, monkeypatch):
     """In at most 1.2 times as many iterations; S⁻¹ is known to 5 %."""
     monkeypatch.setattr(module, "solve_copies", CopyFactors)
-    expected, factorised = after_one_step(swinging(8), solver, device)
+    expected, factorised = after_steps(swinging(8), solver, device)
     monkeypatch.setattr(module, "solve_copies", CopyCycles)
-    found, stepper = after_one_step(swinging(8), solver, device)
-    print(factorised.iterations, stepper.iterations, np.abs(found - expected).max())
+    found, stepper = after_steps(swinging(8), solver, device)
     assert stepper.results == factorised.results == [Result.CONVERGED]
-    assert stepper.iterations < 1.2 * factorised.iterations
-    assert np.abs(found - expected).max() < 1e-7
+    assert stepper.iterations < 1.2 * factorised.iterations and np.abs(found - expected).max() < 1e-7
 
 
 @pytest.mark.parametrize("dense", [12, 300])

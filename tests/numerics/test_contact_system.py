@@ -42,8 +42,7 @@ def test_solutions_have_the_residual_of_the_tolerance(solver, device, monkeypatc
     stepper = on_the_ball(device)
     model, start = stepper.model, wp.clone(stepper.w)
     terms = [elements for elements in model.terms if elements.collider is None]
-    right = stepper.gradient.numpy().reshape(model.copies, -1)
-    counts = []
+    right, counts = stepper.gradient.numpy().reshape(model.copies, -1), []
     for accurate in (True, False):
         wp.copy(stepper.w, start)
         found = solved(stepper, accurate)
@@ -61,8 +60,7 @@ def test_solutions_have_the_residual_of_the_tolerance(solver, device, monkeypatc
                 assert rest @ np.linalg.solve(A, rest) < 1.001 * TOLERANCE**2 * b @ np.linalg.solve(A, b)
             best = b @ scipy.linalg.solve(A + D, b)
             assert 2.0 * b @ w - w @ (A + D) @ w > (0.999 if accurate else 0.5) * best
-    assert (counts[0] > 1).all()
-    assert (counts[1] < counts[0]).all()
+    assert (counts[0] > 1).all() and (counts[1] < counts[0]).all()
 
 
 def test_copies_are_solved_as_alone(device):
@@ -86,6 +84,5 @@ def test_steps_are_halved_until_the_objective_falls(c, trials, device):
         state.proceed.zero_()
         state.other.fill_(c * step**2)
         wp.launch(check_quadratic, dim=1, inputs=[pull, fraction, 30], outputs=[state], device=device)
-    assert done == trials
-    assert state.searching.numpy()[0] == 0
+    assert done == trials and state.searching.numpy()[0] == 0
     assert state.step.numpy()[0] == 0.5 ** (trials - 1)

@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
+from support.steps import after_steps
 from warpcloth.numerics.hierarchy import levels
 from warpcloth.numerics.unfolding import UnfoldedSurface
 from warpcloth.scenes import chain
@@ -86,10 +87,8 @@ def lengths_of(points, pairs):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_levels_of_any_mesh(name):
-    """Each drops vertices linked to what it keeps, none of which are linked; weights are 1 in all; ways have their length.
-
-    In a flat sheet of triangles that keep their shape none is shorter than the distance, else none than over links.
-    """
+    """Each drops vertices linked to what it keeps, none of which are linked; weights are 1 in all; ways have their length."""
+    # In a flat sheet of triangles that keep their shape none is shorter than the distance, else none than over links.
     scene = SCENES[name]
     model = scene.build(dtype="float64")
     n, found = model.per_copy, levels(model)
@@ -97,11 +96,9 @@ def test_levels_of_any_mesh(name):
     assert bool(found) == (name not in WITHOUT)
     if not found:
         return
-    given = [
-        elements.term.max_lengths(scene.mesh.points, elements.stencil.numpy(), elements.rest.numpy())
-        for elements in model.terms
-    ]
-    pairs, lengths = (np.concatenate(each) for each in zip(*[each[:2] for each in given], strict=True))
+    points = scene.mesh.points
+    given = [each.term.max_lengths(points, each.stencil.numpy(), each.rest.numpy())[:2] for each in model.terms]
+    pairs, lengths = (np.concatenate(each) for each in zip(*given, strict=True))
     first = np.lexsort((lengths, pairs.max(axis=1), pairs.min(axis=1)))
     finest, unique = np.unique(np.sort(pairs, axis=1)[first], axis=0, return_index=True)
     graph = coo_array((np.maximum(lengths[first][unique], 1e-300), finest.T), shape=(n, n))
@@ -120,19 +117,16 @@ def test_levels_of_any_mesh(name):
         linked = np.concatenate([each.pairs for each in bounds])
         assert kept[linked].all() and free[linked].any(axis=1).all() and (linked[:, 0] != linked[:, 1]).all()
         ways, over_links = np.concatenate([each.lengths for each in bounds]), shortest[linked[:, 0], linked[:, 1]]
-        stretch = (lengths / lengths_of(scene.mesh.points, pairs)).min() if name in STRAIGHT else None
-        least = over_links if stretch is None else stretch * lengths_of(scene.mesh.points, linked)
-        assert (ways >= least * (1.0 - 100 * EPS) - 1e-200).all()
+        least = over_links
         if name in STRAIGHT:
+            least = (lengths / lengths_of(points, pairs)).min() * lengths_of(points, linked)
             assert (ways <= least * (1.0 + 1e-6)).mean() > 0.9, "nearly all are straight"
+        assert (ways >= least * (1.0 - 100 * EPS) - 1e-200).all()
         assert (ways <= (8.0 if name == "hub" else 1.5) * over_links + 1e-200).all(), "detours stay small"
         there = kept
 
 
-@pytest.mark.parametrize(
-    ("name", "dtype"),
-    slow_but([(name, "float32") for name in SCENES], [*((name, "float32") for name in SCENES), ("grid", "float64")]),
-)
+@table("name, dtype", [(name, "float32") for name in SCENES], [*((name, "float32") for name in SCENES), ("grid", "float64")])
 def test_steps_on_any_mesh_and_copies(name, dtype, device):
     """Of a cloth stretched by a tenth: finite, no more stretched after; pins stay, and copies have the bits of one alone."""
     scene = replace(SCENES[name], positions=1.1 * SCENES[name].mesh.points, gravity=(0.0, 0.0, 0.0))
@@ -160,11 +154,8 @@ def test_reach_of_triangles(name, most):
 
 def test_without_levels_it_is_pbd(device):
     for scene, most in ((SCENES["grid"], 0), (SCENES["bending alone"], None)):
-        runs = [
-            wc.simulate(scene, solver, device=device, frames=5).points
-            for solver in (wc.HierarchicalPBD(substeps=2, levels=most), wc.PBD(substeps=2))
-        ]
-        assert np.array_equal(*runs)
+        solvers = wc.HierarchicalPBD(substeps=2, levels=most), wc.PBD(substeps=2)
+        assert np.array_equal(*(wc.simulate(scene, solver, device=device, frames=5).points for solver in solvers))
 
 
 def crumpled(n):
@@ -184,51 +175,43 @@ def folded(points):
 def test_what_meets_the_constraints_is_left_alone(device):
     """A bound is a way over finer ones, so that no state that meets those is beyond it, folded or straight."""
     grid = SCENES["grid"]
-    hard = [wc.Spring(pairs=("structural", "shear"), stiffness=np.inf)]
+    hard, soft = [wc.Spring(pairs=("structural", "shear"), stiffness=np.inf)], [wc.Spring(stiffness=0.0)]
+    soft.append(wc.SpringLimit(most=1.1))
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     states = {
         "crumpled": replace(SCENES["chain"], positions=crumpled(30), pins=None),
         "folded": replace(grid, terms=hard, positions=folded(grid.mesh.points), pins=None),
         "turned": replace(SCENES["scattered"], positions=SCENES["scattered"].mesh.points @ rotation, pins=None),
         "crushed": replace(grid, terms=[wc.SpringLimit(most=1.0)], positions=0.5 * grid.mesh.points),
-        "soft, below a hard limit": replace(
-            grid, terms=[wc.Spring(stiffness=0.0), wc.SpringLimit(most=1.1)], positions=1.09 * grid.mesh.points, pins=None
-        ),
+        "soft, below a hard limit": replace(grid, terms=soft, positions=1.09 * grid.mesh.points, pins=None),
     }
     for name, scene in states.items():
-        model = replace(scene, gravity=(0.0, 0.0, 0.0)).build(device=device, dtype="float64")
-        stepper = wc.HierarchicalPBD(substeps=1).bind(model)
-        assert stepper.levels
-        stepper.step()
+        x, stepper = after_steps(replace(scene, gravity=(0.0, 0.0, 0.0)), wc.HierarchicalPBD(substeps=1), device)
         # Ways of up to some 10 m are a sum of some ten links, each rounded to ε of the coordinates.
-        assert np.abs(stepper.state.x.numpy() - scene.positions).max() < 1000 * EPS, name
+        assert stepper.levels and np.abs(x - scene.positions).max() < 1000 * EPS, name
 
 
 def test_bent_sheets_meet_the_bounds_of_the_flat_one():
-    """A ring with a slit, rolled to a cone that overlaps by a third of a turn, which parts the sides of the slit.
-
-    Cones and cylinders are isometric to the plane, so that no vertices are farther apart than the shortest path in the sheet.
-    """
+    """A ring with a slit, rolled to a cone that overlaps by a third of a turn, which parts the sides of the slit."""
+    # Cones and cylinders are isometric to the plane, so that no vertices are farther apart than the shortest path in the sheet.
     mesh = wc.Mesh.grid(6, 41, pattern="alternating")
     across, along = (mesh.points / np.ptp(mesh.points, axis=0).clip(1e-9)).T[::2]
     r, turn = 0.4 + 0.6 * across, 0.98 * np.pi * (2.0 * along - 1.0)
-    flat = wc.Mesh(np.stack([r * np.sin(turn), 0.0 * r, r * np.cos(turn)], axis=1), mesh.triangles)
-    tip = 0.75
+    flat, tip = wc.Mesh(np.stack([r * np.sin(turn), 0.0 * r, r * np.cos(turn)], axis=1), mesh.triangles), 0.75
     cone = np.stack([tip * r * np.sin(turn / tip), np.sqrt(1.0 - tip**2) * r, tip * r * np.cos(turn / tip)], axis=1)
     x, y, z = flat.points.T
     rolled = np.stack([0.2 * np.sin(x / 0.2), y - 0.2 * np.cos(x / 0.2), z], axis=1)
     bounds = [level.bounds[1] for level in levels(wc.Scene(flat, density=0.1, terms=[wc.StrainLimit(most=1.0)]).build())]
     sides = lengths_of(flat.points, flat.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)).reshape(-1, 3)
-    over_links = dijkstra(coo_array((flat.edge_lengths, flat.edges.T), shape=(len(r), len(r))), directed=False)
     every = np.stack(np.triu_indices(len(r), 1), axis=1)
-    straight = UnfoldedSurface(flat.points, flat.triangles, sides, np.zeros(len(r), dtype=bool)).shortened(
-        every, over_links[tuple(every.T)]
-    )
+    links_of = dijkstra(coo_array((flat.edge_lengths, flat.edges.T), shape=(len(r), len(r))), directed=False)
+    over_links, surface = links_of[tuple(every.T)], UnfoldedSurface(flat.points, flat.triangles, sides, 0.0 * r > 0.0)
+    straight = surface.shortened(every, over_links)
     pairs = np.concatenate([each.pairs for each in bounds] + [every])
     lengths = np.concatenate([each.lengths for each in bounds] + [straight])
     for state in (flat.points, cone, rolled):
         assert (lengths >= lengths_of(state, pairs) * (1.0 - 100 * EPS)).all()
-    assert (straight < over_links[tuple(every.T)] * (1.0 - 1e-3)).mean() > 0.1, "many straight paths, or this proves nothing"
+    assert (straight < over_links * (1.0 - 1e-3)).mean() > 0.1, "many straight paths, or this proves nothing"
     assert (lengths_of(cone, every) > 1.1 * lengths_of(flat.points, every)).any(), "the sides of the slit part"
 
 
@@ -237,22 +220,16 @@ def test_straight_paths_cross_what_keeps_its_shape():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [1.0, 0, 1.0], [0.0, 0, 1.0]])
     triangles, sides = np.array([[0, 1, 3], [1, 2, 3]]), np.array([[1.0, np.sqrt(2.0), 1.0], [1.0, 1.0, np.sqrt(2.0)]])
     longer = sides * [[1.0], [1.1]]
-    for lengths, fixed, expected in (
-        (sides, [], np.sqrt(2.0)),
-        (sides, [1, 3], 2.0),
-        (longer, [], 2.0),
-        (sides * 1e-200, [], 2.0),
-    ):
+    cases = (sides, [], np.sqrt(2.0)), (sides, [1, 3], 2.0), (longer, [], 2.0), (sides * 1e-200, [], 2.0)
+    for lengths, fixed, expected in cases:
         surface = UnfoldedSurface(points, triangles, lengths, np.isin(np.arange(4), fixed))
         assert surface.shortened(np.array([[0, 2]]), np.array([2.0])) == pytest.approx(expected, rel=8 * EPS)
 
 
 @pytest.mark.parametrize("kind", ["grid", "jittered", "random"])
 def test_levels_gain_as_much_on_any_mesh(kind, device):
-    """RMS strain of a hard net that swings by two corners, that of PBD over that with levels: 3 or more at equal settings.
-
-    With the lengths of paths over links alone it is 7.6, 1.4 and 1.5.
-    """
+    """RMS strain of a hard net that swings by two corners, that of PBD over that with levels: 3 or more at equal settings."""
+    # With the lengths of paths over links alone it is 7.6, 1.4 and 1.5.
     mesh = wc.Mesh.grid(17, 17, pattern="alternating") if kind == "grid" else uneven(17, kind)
     pins = [int(np.abs(mesh.points - corner).sum(axis=1).argmin()) for corner in ([0.0, 0, 0], [1.0, 0, 0])]
     hung = wc.Scene(mesh, masses=np.full(len(mesh.points), 1.0), terms=[wc.Spring(stiffness=np.inf)], pins=pins)
@@ -260,7 +237,6 @@ def test_levels_gain_as_much_on_any_mesh(kind, device):
     for solver in (wc.PBD, wc.HierarchicalPBD):
         run = wc.simulate(hung, solver(substeps=4, iterations=5), device=device, dtype="float64", frames=40)
         strain.append(np.mean([(lengths_of(x, mesh.edges) / mesh.edge_lengths - 1.0) ** 2 for x in run.points[1:]]))
-    print(kind, np.sqrt(strain[0] / strain[1]))
     assert strain[0] > 9.0 * strain[1]
 
 
@@ -302,12 +278,11 @@ def test_copies_of_unlike_stiffness_are_as_alone(device):
     base = replace(SCENES["chain"], terms=[wc.Spring(stiffness=1.0)])
     stiffness, solver = [0.0, 50.0, np.inf], wc.HierarchicalPBD(substeps=1, iterations=3)
     kept = {"device": device, "dtype": "float64", "frames": 5}
-    model = base.build(dtype="float64", copies=3, vary={"Spring.stiffness": stiffness})
-    assert levels(model)
-    batch = wc.simulate(base, solver, copies=3, vary={"Spring.stiffness": stiffness}, **kept).points
-    for copy in range(3):
-        alone = replace(base, terms=[wc.Spring(stiffness=stiffness[copy])])
-        points = wc.simulate(alone, solver, **kept).points
+    build = {"copies": 3, "vary": {"Spring.stiffness": stiffness}}
+    assert levels(base.build(dtype="float64", **build))
+    batch = wc.simulate(base, solver, **build, **kept).points
+    for copy, k in enumerate(stiffness):
+        points = wc.simulate(replace(base, terms=[wc.Spring(stiffness=k)]), solver, **kept).points
         assert np.abs(batch[:, copy] - points).max() < 1e-9
 
 
@@ -341,7 +316,6 @@ def test_stretch_grows_with_resolution_only_without_levels(device):
             hung = replace(hung, positions=hung.mesh.points[:, [1, 0, 2]])  # level, so that it swings
             animation = wc.simulate(hung, solver(substeps=1, iterations=10), device=device, dtype="float64", frames=60)
             stretch[solver, n] = max(lengths_of(x, hung.mesh.edges).sum() for x in animation.points) - 1.0
-    print(stretch)
     assert stretch[wc.PBD, 64] > 3.0 * stretch[wc.PBD, 16]
     assert stretch[wc.HierarchicalPBD, 256] < 0.1 * stretch[wc.PBD, 256]
 

@@ -86,13 +86,10 @@ DRIVEN = {
 
 @pytest.mark.parametrize("name", DRIVEN)
 def test_the_scale_of_residuals(name, device):
-    """g + (F + W)/M, else R/T²: in both precisions, turned, with other numbers of the vertices, and of each copy.
-
-    It has the same bits if lengths grow 4 times with times twice as long, which leaves accelerations, or if masses double.
-    """
+    """g + (F + W)/M, else R/T²: in both precisions, turned, with other numbers of the vertices, and of each copy."""
+    # It has the same bits if lengths grow 4 times with times twice as long, which leaves accelerations, or if masses double.
     fields, expected, unit = DRIVEN[name]
-    fields = {"gravity": NONE, "duration": 2.0, **fields}
-    radius = 0.5
+    fields, radius = {"gravity": NONE, "duration": 2.0, **fields}, 0.5
     unit = unit or "times the radius of the cloth over the square of the duration"
 
     def scale(dtype="float64", copies=1, order=None, mesh=GRID, density=0.5, **changed):

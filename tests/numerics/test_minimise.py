@@ -1,5 +1,7 @@
 """The descent that Newton's method and equilibrium share: where it ends for its precision, and which steps it takes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import warp as wp
@@ -18,16 +20,13 @@ LENGTH = 0.25
 
 
 def sagging(stiffness, apart):
-    """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins that is too long by ``apart`` [m].
-
-    The first of these has no force but what its length is rounded by, the other one has a large energy that stays. The corners
-    of the sheet are pinned, for where inertia alone resists it would descend for ever.
-    """
+    """A crumpled sheet, which descends slowly, beside a spring at rest and one between pins, too long by ``apart`` [m]."""
+    # The first of these has no force but what its length is rounded by, the other one has a large energy that stays. The
+    # corners of the sheet are pinned, for where inertia alone resists it would descend for ever.
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     corner = LENGTH * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     points = np.concatenate([grid.points, np.add(corner, [3.0, 0.0, 0.0]), np.add(corner, [6.0, 0.0, 0.0])])
-    mesh = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]]))
-    start = points.copy()
+    mesh, start = wc.Mesh(points, np.concatenate([grid.triangles, [[25, 26, 27], [28, 29, 30]]])), points.copy()
     start[:25, 1] = 1e-3 * np.random.default_rng(0).normal(size=25)
     start[28, 0] -= apart
     terms = [wc.QuadraticBending(stiffness=1e-3), wc.Spring(pairs=[[25, 26], [28, 29]], stiffness=[stiffness, 1e4])]
@@ -53,13 +52,11 @@ def energies(scene, corrections, device):
 
 
 def test_a_descent_ends_where_it_gains_what_rounding_loses(device):
-    """What rounding d loses is measured in float64, by adding roundings of ε|d| to the d of the end and subtracting them.
-
-    The mean of both has no part of first order. That part is as large, because the end is not quite the minimum. Roundings are
-    even in ±½ε, and have squares of ε²/12; the spacing of numbers in float32 is ½ε|d| to ε|d|. The estimate adds up worst cases
-    of ε over the N = 13 blocks of a row of bending, multiples of I, by their Frobenius norms: √3·12·N as much, of which the
-    descent takes a tenth.
-    """
+    """What rounding d loses is measured in float64, by adding roundings of ε|d| to the d of the end and subtracting them."""
+    # The mean of both has no part of first order. That part is as large, because the end is not quite the minimum. Roundings
+    # are even in ±½ε, and have squares of ε²/12; the spacing of numbers in float32 is ½ε|d| to ε|d|. The estimate adds up worst
+    # cases of ε over the N = 13 blocks of a row of bending, multiples of I, by their Frobenius norms: √3·12·N as much, of which
+    # the descent takes a tenth.
     scene, random = sagging(1e4, 0.0), np.random.default_rng(0)
     minimiser, result = descent(scene, device)
     assert result is Result.ROUNDED
@@ -84,10 +81,8 @@ def test_a_descent_goes_on_where_a_large_energy_hides_its_gains(device):
 
 
 def test_a_step_that_raises_the_energy_is_shortened(device):
-    """Where the slope falls to 0.84 of it, which would do if rounding hid the rise of 1e-5; energies are known to 1e-16.
-
-    A spring from a pin 1 m beside the line of the steps has two wells, which an attachment makes unequal.
-    """
+    """Where the slope falls to 0.84 of it, which would do if rounding hid the rise of 1e-5; energies are known to 1e-16."""
+    # A spring from a pin 1 m beside the line of the steps has two wells, which an attachment makes unequal.
 
     def energy(t):
         return 0.5 * (np.hypot(1.0, t) - 1.4) ** 2 + 0.01 * (t + 3.0) ** 2
@@ -95,11 +90,9 @@ def test_a_step_that_raises_the_energy_is_shortened(device):
     start = -2.2
     end = brentq(lambda t: energy(t) - (1.0 + 1e-5) * energy(start), 1.0, 3.0)
     mesh = wc.Mesh(np.array([[0.0, 1.0, 0.0], [start, 0.0, 0.0]]), edges=[[0, 1]])
-    terms = [
-        wc.Spring(stiffness=1.0, rest_lengths=1.4),
-        wc.Attachment(vertices=[1], targets=[[-3.0, 0.0, 0.0]], stiffness=0.02),
-    ]
-    model = wc.Scene(mesh, masses=[1.0, 1.0], terms=terms, pins=[0], gravity=(0.0, 0.0, 0.0)).build(device=device)
+    hold = wc.Attachment(vertices=[1], targets=[[-3.0, 0.0, 0.0]], stiffness=0.02)
+    scene = wc.Scene(mesh, masses=[1.0, 1.0], terms=[wc.Spring(stiffness=1.0, rest_lengths=1.4), hold], pins=[0])
+    model = replace(scene, gravity=(0.0, 0.0, 0.0)).build(device=device)
     minimiser = Minimiser(model, model.positions, "raw", "cg", s=0.0)
     minimiser.clear()
     minimiser.active.fill_(1)
@@ -125,16 +118,13 @@ STIFF = {
 
 @pytest.mark.parametrize("name", STIFF)
 def test_steps_of_stiff_cloth_are_exact_to_the_rounding_of_positions(name, device):
-    """Steps in float32, each against a converged one in float64 from the same state.
-
-    x̃ and x̃ + d are each rounded by up to ½ε|x|; a fifth of their sum is for roundings of d, of the mass and of the rest state.
-    """
+    """Steps in float32, each against a converged one in float64 from the same state."""
+    # x̃ and x̃ + d are each rounded by up to ½ε|x|; a fifth of their sum is for roundings of d, of the mass and of the rest
+    # state.
     terms, bound = STIFF[name]
     scene = wc.Scene(GRID, density=0.15, terms=terms, pins="z == 0")
-    found, exact = (
-        wc.Newton(substeps=4, **options).bind(scene.build(device=device, dtype=dtype))
-        for dtype, options in (("float32", {}), ("float64", {"tolerance": 1e-8, "linear": "factorised"}))
-    )
+    found = wc.Newton(substeps=4).bind(scene.build(device=device))
+    exact = wc.Newton(substeps=4, tolerance=1e-8, linear="factorised").bind(scene.build(device=device, dtype="float64"))
     for _ in range(24):
         for ours, theirs in zip(exact.state.arrays.values(), found.state.arrays.values(), strict=True):
             ours.assign(theirs.numpy())
@@ -147,9 +137,8 @@ def test_steps_of_stiff_cloth_are_exact_to_the_rounding_of_positions(name, devic
 @pytest.mark.parametrize("apart", [1e-4, 1e-3])
 def test_a_quadratic_energy_takes_one_whole_step(apart, device):
     """Of copies pulled to two sides, whose energy k(1 + s²) has no digits for s²: its rounding may not halve the step."""
-    copies, random = 64, np.random.default_rng(1)
-    targets = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    terms = [wc.Attachment(vertices=[0], targets=targets[[side]], stiffness=100.0, name=f"side {side}") for side in (0, 1)]
+    copies, random, hold = 64, np.random.default_rng(1), {"vertices": [0], "stiffness": 100.0}
+    terms = [wc.Attachment(targets=[[side, 0.0, 0.0]], name=f"side {side}", **hold) for side in (1.0, -1.0)]
     mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), edges=[[0, 1]])
     scene = wc.Scene(mesh, masses=[1.0, 1.0], terms=terms, pins=[1])
     start = np.repeat(mesh.points[None], copies, axis=0)
@@ -165,11 +154,9 @@ def test_a_quadratic_energy_takes_one_whole_step(apart, device):
 
 @pytest.mark.parametrize("method", ["cg", "factorised"])
 def test_each_copy_ends_by_itself(method, device):
-    """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone.
-
-    The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device does
-    before the host looks.
-    """
+    """Crumpled sheets of unlike stiffness beside one in balance and one that is not finite, to the bits of each alone."""
+    # The raw Hessian of the crumpled ones has negative curvatures, and they take more iterations than the loop on the device
+    # does before the host looks.
     grid = wc.Mesh.grid(5, 5, size=4 * LENGTH)
     crumpled = 0.3 * grid.points + 0.05 * np.random.default_rng(0).normal(size=grid.points.shape)
     start = np.stack([crumpled, grid.points, crumpled, crumpled])
@@ -211,13 +198,10 @@ def test_steps_start_from_the_last_correction(device):
             iterations[k] += stepper.iterations
         assert np.abs(warm.state.x.numpy() - cold.state.x.numpy()).max() < 1e-10
     assert 0 < iterations[0] < 0.9 * iterations[1], iterations
-    before = warm.state.copy()
-    ends = []
+    before, ends = warm.state.copy(), []
     for size in (0.0, 1.0):  # in the second copy
         warm.state.assign(before)
-        guess = np.zeros((2, 64, 3))
-        guess[1, 10] = size
-        warm.correction.assign(guess.reshape(-1, 3))
+        warm.correction.assign(size * (np.arange(128)[:, None] == 74) * np.ones(3))
         warm.step()
         ends.append(warm.state.x.numpy())
     np.testing.assert_array_equal(*ends)
@@ -291,6 +275,5 @@ def test_the_negative_part_is_reduced_as_far_as_needed_and_restored_by_quarters(
             given = [negative, policy, outdated, wanted, unsolved]
             wp.launch(kernels.find_indefinite(), 3, inputs=given, device=device)
         assert outdated.numpy().tolist() == [1, 0, 1]
-    assert found[0] == [1.0] + 4 * [0.75, 0.5]
-    assert found[1] == [1.0] * 4
+    assert found[0] == [1.0] + 4 * [0.75, 0.5] and found[1] == [1.0] * 4
     assert found[2] == [1.0, 0.75, 0.5] + 4 * [0.25, 0.0]

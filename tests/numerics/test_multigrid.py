@@ -1,6 +1,7 @@
 """Multigrid as a preconditioner: its levels, its cycle against matrices on the host, and what Newton's method gains by it."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from scipy.linalg import block_diag
 
 import warpcloth as wc
 from support.continuum import flat, hill, jittered
-from support.rows import slow_but
+from support.matrices import block_matrix
+from support.rows import table
 from support.scenes import scene
+from support.steps import after_frames
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.linear import turn_and_multiply
 from warpcloth.kernels.multigrid import OMEGA
@@ -35,10 +38,8 @@ MESHES = {
 
 @pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 def test_levels_interpolate_affine_functions(mesh):
-    """Weights sum to 1, kept vertices keep their values, and flat meshes interpolate positions but for the added moments, 1e-4.
-
-    A vertex of a curved mesh lies off the plane of its parents by about κL²/2.
-    """
+    """Weights sum to 1, kept vertices keep values, and flat meshes interpolate positions but for the added moments, 1e-4."""
+    # A vertex of a curved mesh lies off the plane of its parents by about κL²/2.
     free = np.ones(len(mesh.points), dtype=bool)
     free[3] = False
     found = interpolations(mesh.points, neighbours(mesh), free, 4)
@@ -63,14 +64,9 @@ def test_levels_interpolate_affine_functions(mesh):
 
 def compressed(device, copies=2):
     """A Hessian of springs in compression, of unlike copies; it is indefinite."""
-    mesh = flat(12)
-    declared = wc.Scene(
-        mesh,
-        density=0.1,
-        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)],
-        positions=0.9 * mesh.points + 0.01 * np.random.default_rng(0).normal(size=mesh.points.shape),
-        pins=[0, 5],
-    )
+    mesh, terms = flat(12), [wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)]
+    positions = 0.9 * mesh.points + 0.01 * np.random.default_rng(0).normal(size=mesh.points.shape)
+    declared = wc.Scene(mesh, density=0.1, terms=terms, positions=positions, pins=[0, 5])
     model = declared.build(device=device, dtype="float64", copies=copies, vary={"Spring.stiffness": np.logspace(2, 4, copies)})
     hessian = Hessian(model, HessianPolicy.RAW)
     hessian.assemble(model.positions, 1e3)
@@ -93,70 +89,55 @@ def applied(multigrid, count, copies):
     return found
 
 
-def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(device):
-    """x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep, by dense matrices; A has negative eigenvalues."""
+def transfers_of(hessian):
+    """P of each level, over coordinates."""
+    model = hessian.model
+    free = model.inverse_mass.numpy()[: hessian.per_copy] > 0.0
+    found = interpolations(model.rest_points, neighbours(model.scene.mesh), free, COARSEST)
+    return [np.kron(P.toarray(), np.eye(3)) for P in found]
+
+
+def sweeps(level, n, copy):
+    return block_diag(*level.sweep.numpy()[copy * n : (copy + 1) * n])
+
+
+def v_cycle(multigrid, copy, A, M, transfers):
+    """M but for what is no x ← x + S(b − Ax), coarse correction P(PᵀAP)⁻¹Pᵀ, sweep; and its relative error."""
+    # The coarse part C of M = 2S − SAS + (I − SA) P C Pᵀ (I − AS) is the cycle of PᵀAP.
+    S, P = sweeps(multigrid, len(A) // 3, copy), transfers[0]
+    E, smooth = np.eye(len(A)) - S @ A, 2.0 * S - S @ A @ S
+    C = np.linalg.pinv(E @ P) @ (M - smooth) @ np.linalg.pinv(E @ P).T
+    return smooth + E @ P @ C @ P.T @ E.T, 1e-6 * np.abs(M - smooth).max()
+
+
+def additive(multigrid, copy, A, M, transfers):
+    """S + P̄ M_c P̄ᵀ with P̄ = P − S A P, and the inverse on the last level; and its error."""
+    expected, to_finest, last = np.zeros_like(A), np.eye(len(A)), multigrid.levels[-1]
+    for level, P in zip(multigrid.levels, transfers, strict=False):
+        S = sweeps(level, level.n, copy)
+        expected += to_finest @ S @ to_finest.T
+        A, to_finest = P.T @ A @ P, to_finest @ (P - S @ A @ P)
+    inverse = last.values.numpy().reshape(2, last.n, last.n, 3, 3)[copy].swapaxes(1, 2).reshape(3 * last.n, -1)
+    return expected + to_finest @ inverse @ to_finest.T, 1e-10 * np.abs(M).max()
+
+
+@pytest.mark.parametrize(("kind", "by_levels"), [(VCycle, v_cycle), (AdditiveMultigrid, additive)])
+def test_a_cycle_is_symmetric_positive_definite_and_that_of_its_levels(kind, by_levels, device):
+    """By dense matrices; A has negative eigenvalues."""
     hessian = compressed(device)
-    multigrid = VCycle(hessian)
+    multigrid, n, transfers = kind(hessian), hessian.per_copy, transfers_of(hessian)
     multigrid.update()
-    B, n = 2, hessian.per_copy
-    cycles = applied(multigrid, n, B)
-    transfers = interpolations(
-        hessian.model.rest_points, neighbours(hessian.model.scene.mesh), hessian.model.inverse_mass.numpy()[:n] > 0.0, COARSEST
-    )
-    assert multigrid.sizes == [n, *(P.shape[1] for P in transfers)] and len(transfers) > 1
-    for copy, A in enumerate(hessian.matrices()):
-        A = A.toarray()
+    cycles = applied(multigrid, n, 2)
+    assert multigrid.sizes == [n, *(P.shape[1] // 3 for P in transfers)] and len(transfers) > 1
+    for copy, (A, M) in enumerate(zip(hessian.matrices(), cycles, strict=True)):
+        A, root = A.toarray(), np.linalg.cholesky(sweeps(multigrid, n, copy))
         assert np.linalg.eigvalsh(A)[0] < 0.0
-        S = np.zeros_like(A)
-        for i, block in enumerate(multigrid.sweep.numpy()[copy * n : (copy + 1) * n]):
-            S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
         # No eigenvalue of S A is above ω.
-        root = np.linalg.cholesky(S)
         assert np.linalg.eigvalsh(root.T @ A @ root)[-1] <= OMEGA * (1.0 + 1e-9)
-        M = cycles[copy]
         np.testing.assert_allclose(M, M.T, atol=1e-9 * np.abs(M).max())
         assert np.linalg.eigvalsh(0.5 * (M + M.T))[0] > 0.0
-        # The coarse part C of M = 2S − SAS + (I − SA) P C Pᵀ (I − AS) is the cycle of PᵀAP.
-        rest = M - (2.0 * S - S @ A @ S)
-        P, E = np.kron(transfers[0].toarray(), np.eye(3)), np.eye(len(A)) - S @ A
-        C = np.linalg.pinv(E @ P) @ rest @ np.linalg.pinv(E @ P).T
-        np.testing.assert_allclose(E @ P @ C @ P.T @ E.T, rest, atol=1e-6 * np.abs(rest).max())
-
-
-def test_additive_multigrid_is_symmetric_positive_definite_and_that_of_its_levels(device):
-    """M = S + P̄ M_c P̄ᵀ with P̄ = P − S A P by dense matrices, and the inverse on the last level; A has negative eigenvalues."""
-    hessian = compressed(device)
-    multigrid = AdditiveMultigrid(hessian)
-    multigrid.update()
-    B, n = 2, hessian.per_copy
-    found = applied(multigrid, n, B)
-    transfers = interpolations(
-        hessian.model.rest_points, neighbours(hessian.model.scene.mesh), hessian.model.inverse_mass.numpy()[:n] > 0.0, COARSEST
-    )
-    assert multigrid.sizes == [n, *(P.shape[1] for P in transfers)] and len(transfers) > 1
-
-    def sweeps(level, copy):
-        blocks = level.sweep.numpy()[copy * level.n : (copy + 1) * level.n]
-        return block_diag(*blocks)
-
-    for copy, A in enumerate(hessian.matrices()):
-        A = A.toarray()
-        assert np.linalg.eigvalsh(A)[0] < 0.0
-        S = sweeps(multigrid.levels[0], copy)
-        # No eigenvalue of S A is above ω.
-        root = np.linalg.cholesky(S)
-        assert np.linalg.eigvalsh(root.T @ A @ root)[-1] <= OMEGA * (1.0 + 1e-9)
-        expected, to_finest = np.zeros_like(A), np.eye(len(A))
-        for k, P in enumerate(transfers):
-            S, P = sweeps(multigrid.levels[k], copy), np.kron(P.toarray(), np.eye(3))
-            expected += to_finest @ S @ to_finest.T
-            A, to_finest = P.T @ A @ P, to_finest @ (P - S @ A @ P)
-        last = multigrid.levels[-1]
-        inverse = last.values.numpy().reshape(B, last.n, last.n, 3, 3)[copy].swapaxes(1, 2).reshape(3 * last.n, -1)
-        expected += to_finest @ inverse @ to_finest.T
-        M = found[copy]
-        np.testing.assert_allclose(M, expected, atol=1e-10 * np.abs(M).max())
-        assert np.linalg.eigvalsh(0.5 * (M + M.T))[0] > 0.0
+        expected, error = by_levels(multigrid, copy, A, M, transfers)
+        np.testing.assert_allclose(M, expected, atol=error)
 
 
 def test_coarse_matrices_are_products_with_the_interpolation(device):
@@ -164,24 +145,12 @@ def test_coarse_matrices_are_products_with_the_interpolation(device):
     hessian = compressed(device)
     multigrid = multigrid_of(hessian)
     multigrid.update()
-    found = interpolations(
-        hessian.model.rest_points,
-        neighbours(hessian.model.scene.mesh),
-        hessian.model.inverse_mass.numpy()[: hessian.per_copy] > 0.0,
-        COARSEST,
-    )
     for copy, A in enumerate(hessian.matrices()):
         A = A.toarray()
-        for k, P in enumerate(found):
-            P = np.kron(P.toarray(), np.eye(3))
+        for k, P in enumerate(transfers_of(hessian)):
             A, level = P.T @ A @ P, multigrid.levels[k + 1]
-            n = level.n
-            offsets, columns, values = (each.numpy() for each in (level.offsets, level.columns, level.values))
-            dense = np.zeros((3 * n, 3 * n))
-            for i in range(n):
-                for s in range(offsets[copy * n + i], offsets[copy * n + i + 1]):
-                    j = columns[s] - copy * n
-                    dense[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = values[s]
+            n, own = level.n, slice(3 * copy * level.n, 3 * (copy + 1) * level.n)
+            dense = block_matrix(level)[own, own]
             if level is multigrid.levels[-1] and np.linalg.eigvalsh(A)[0] > 0.0:
                 np.testing.assert_allclose(dense @ A, np.eye(3 * n), atol=1e-8)
             elif level is not multigrid.levels[-1]:
@@ -218,11 +187,9 @@ def chosen(hessian):
 
 def iterations(n, stiffness, device, used):
     """Of such a solve by multigrid if ``used``, or else with diagonal blocks."""
-
-    def make(hessian):
-        return ConjugateGradients(hessian, 10_000, multigrid_of(hessian) if used else None)
-
-    return int(weighed(n, stiffness, device, make).iteration.numpy()[0])
+    make = partial(ConjugateGradients, iterations=10_000)
+    solver = weighed(n, stiffness, device, lambda hessian: make(hessian, multigrid=multigrid_of(hessian) if used else None))
+    return int(solver.iteration.numpy()[0])
 
 
 @pytest.mark.parametrize("stiffness, most", [(1e3, 40), (1e5, 120)])
@@ -230,16 +197,13 @@ def test_iterations_hardly_depend_on_resolution(device, stiffness, most):
     """With diagonal blocks they grow as the number of vertices per side until inertia limits them."""
     fine = {used: iterations(48, stiffness, device, used) for used in (True, False)}
     coarse = {used: iterations(16, stiffness, device, used) for used in (True, False)}
-    assert fine[True] <= most
-    assert fine[True] <= 1.5 * coarse[True] + 2
-    assert fine[False] >= 1.8 * coarse[False]
-    assert fine[True] <= fine[False] / 5
+    assert fine[True] <= most and fine[True] <= 1.5 * coarse[True] + 2
+    assert fine[False] >= 1.8 * coarse[False] and fine[True] <= fine[False] / 5
 
 
 def locked():
     """``hanging`` with a line of vertices that slide along the vertical."""
-    declared = scene("hanging", n=15)
-    axes = np.ones((225, 3), dtype=bool)
+    declared, axes = scene("hanging", n=15), np.ones((225, 3), dtype=bool)
     axes[105:120, [0, 2]] = False
     return replace(declared, free_axes=axes)
 
@@ -253,7 +217,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(["hanging", "locked", "copies"], SCENES))
+@table("name", ["hanging", "locked", "copies"], SCENES)
 def test_the_minimiser_does_not_depend_on_the_preconditioner(device, name):
     """After three frames, to the tolerance of Newton's iteration."""
     declared, build = SCENES[name]
@@ -275,9 +239,7 @@ def test_each_copy_chooses_what_costs_less(device):
     declared, stiffness = scene("hanging", n=24), [1.0, 1e5]
 
     def ends(**build):
-        stepper = wc.Newton(substeps=8).bind(declared.build(device=device, dtype="float64", **build))
-        for _ in range(2):
-            stepper.frame()
+        stepper = after_frames(declared, wc.Newton(substeps=8), 2, device=device, dtype="float64", **build)
         first = stepper.state.x.numpy()
         stepper.reset()
         for _ in range(2):
@@ -326,8 +288,7 @@ def test_diagonal_blocks_stop_where_multigrid_costs_less(device):
 
     assert iterations(16, 1e5, device, False) > 60
     solver = weighed(16, 1e5, device, make)
-    assert int(solver.iteration.numpy()[0]) == 45
-    assert solver.choice.kept["preconditioner"].numpy()[0, 0] == 0
+    assert int(solver.iteration.numpy()[0]) == 45 and solver.choice.kept["preconditioner"].numpy()[0, 0] == 0
 
 
 def test_a_negative_curvature_changes_no_choice(device):

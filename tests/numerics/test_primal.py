@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.matrices import block_matrix
 from support.scenes import scene
 from warpcloth.kernels import primal as kernels
 from warpcloth.numerics.constraints import Constraints
@@ -67,12 +68,7 @@ def test_both_the_matrix_and_the_solution(terms, locked, device):
     np.add.at(J, (rows, columns), values)
     free = model.coordinate_mobility() > 0.0
     expected = J.T @ (D[:, None] * J) + np.diag(np.repeat(model.mass.numpy(), 3))
-    matrix, n = solver._matrix, 3 * model.per_copy
-    offsets, whole = matrix.offsets.numpy(), np.zeros(expected.shape)
-    for i in range(model.count):
-        for s in range(offsets[i], offsets[i + 1]):
-            j = matrix.columns.numpy()[s]
-            whole[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = matrix.values.numpy()[s]
+    whole, n = block_matrix(solver._matrix), 3 * model.per_copy
     assert np.abs((whole - expected)[np.ix_(free, free)]).max() < 1e-12 * np.abs(expected).max()
     assert not whole[np.ix_(free, ~free)].any() and whole[:n, :n].any()
 
@@ -92,8 +88,7 @@ def test_hard_rows_that_are_redundant(device):
 
 def test_steps_of_large_meshes_end_where_those_of_rows_do(device, monkeypatch):
     """Two frames of ``hanging`` with 15² vertices; a run by conjugate gradients over rows ends there too."""
-    declared = scene("hanging", n=15)
-    found = []
+    declared, found = scene("hanging", n=15), []
     for least in (constrained_dynamics.MIN_VERTICES, 10**9):
         monkeypatch.setattr(constrained_dynamics, "MIN_VERTICES", least)
         stepper = wc.ConstrainedDynamics(substeps=2, tolerance=1e-9, iterations=100).bind(

@@ -7,6 +7,7 @@ import pytest
 
 import warpcloth as wc
 from support.scenes import scene as named
+from support.steps import after_frames, hanging_mass
 from warpcloth.core.status import Result
 from warpcloth.solvers.error_steps import KEPT, LONGEST, SHORTEST
 
@@ -16,10 +17,8 @@ OMEGA = np.sqrt(STIFFNESS / MASS)
 
 def oscillator(damping=None, fps=4.0):
     """A mass on a spring along gravity, which starts at rest at the rest length."""
-    mesh = wc.Mesh.chain(2, length=1.0)
-    down = (mesh.points[1] - mesh.points[0]) / np.linalg.norm(mesh.points[1] - mesh.points[0])
-    spring = wc.Spring(stiffness=STIFFNESS, damping=damping)
-    return wc.Scene(mesh, masses=[MASS, MASS], terms=[spring], pins=[0], gravity=GRAVITY * down, fps=fps)
+    terms = [wc.Spring(stiffness=STIFFNESS, damping=damping)]
+    return replace(hanging_mass(STIFFNESS, MASS, 0.0), terms=terms, fps=fps)
 
 
 def fall(t, damping=0.0):
@@ -108,8 +107,7 @@ def test_frames_steps_resets_and_states_give_the_same_bits():
     for frame in range(14):
         frames.frame()
         lengths.append(frames.steps_per_frame)
-        assert sum(1 for _ in steps.steps_of_frame()) == lengths[-1]
-        assert frames.state == steps.state
+        assert sum(1 for _ in steps.steps_of_frame()) == lengths[-1] and frames.state == steps.state
         if frame == 6:
             again.state.from_host(frames.state.to_host())
         elif frame > 6:
@@ -120,7 +118,7 @@ def test_frames_steps_resets_and_states_give_the_same_bits():
         steps.reset()
     frames.reset()
     frames.frame()
-    assert frames.state == bound_after(scene, 1)
+    assert frames.state == after_frames(scene, wc.Newton(error=1e-3), 1, dtype="float64").state
 
 
 def test_copies_of_threads_are_reset_as_those_of_one():
@@ -136,30 +134,19 @@ def test_copies_of_threads_are_reset_as_those_of_one():
     np.testing.assert_array_equal(*found)
 
 
-def bound_after(scene, frames):
-    stepper = bound(scene, wc.Newton(error=1e-3))
-    for _ in range(frames):
-        stepper.frame()
-    return stepper.state
-
-
 def test_all_copies_take_the_steps_of_the_one_that_needs_them():
     scene, record, stiffness = oscillator(), wc.Newton(error=1e-4, tolerance=1e-10), [STIFFNESS, 16.0 * STIFFNESS]
     taken = []
     for values in (stiffness, stiffness[:1], stiffness[1:]):
-        stepper = bound(scene, record, copies=len(values), vary={"Spring.stiffness": values})
-        for _ in range(4):
-            stepper.frame()
-        taken.append(stepper.length.taken)
+        build = {"dtype": "float64", "copies": len(values), "vary": {"Spring.stiffness": values}}
+        taken.append(after_frames(scene, record, 4, **build).length.taken)
     both, *alone = taken
     assert both >= max(alone) > 1.2 * min(alone)
 
 
 def test_a_step_that_is_not_accurate_enough_is_reported():
-    found = wc.simulate(oscillator(), wc.Newton(error=1e-18), frames=1, dtype="float64")
-    assert (
-        found.status.result is Result.INACCURATE and "error above its tolerance with the shortest step" in found.status.message
-    )
+    status = wc.simulate(oscillator(), wc.Newton(error=1e-18), frames=1, dtype="float64").status
+    assert status.result is Result.INACCURATE and "error above its tolerance with the shortest step" in status.message
 
 
 def test_records_of_moving_pins_do_not_change_the_motion_and_others_are_refused():
@@ -180,14 +167,8 @@ def test_the_share_of_cut_moves_is_one_of_time(error):
     sheet = wc.Mesh.grid(3, 3, size=0.2)
     mesh = wc.Mesh.join({"stopped": sheet, "free": wc.Mesh(sheet.points + np.array([1.0, 0.0, 0.0]), sheet.triangles)})
     below = wc.Box(size=(1.0, 0.2, 1.0), position=(0.0, -0.101, 0.0))
-    scene = wc.Scene(
-        mesh,
-        density=0.15,
-        terms=[wc.Spring(stiffness=100.0)],
-        colliders=[below],
-        contact=wc.Contact(stiffness=1e-3, distance=1e-4),  # too soft to bear the sheet
-        duration=8 / 60,
-    )
+    fields = {"colliders": [below], "contact": wc.Contact(stiffness=1e-3, distance=1e-4)}  # too soft to bear the sheet
+    scene = wc.Scene(mesh, density=0.15, terms=[wc.Spring(stiffness=100.0)], duration=8 / 60, **fields)
     stepper = bound(scene, wc.Newton(error=error))
     steps = [stepper.frame() or stepper.steps_per_frame for _ in range(8)]
     assert steps[0] > steps[1] and steps[0] >= 8

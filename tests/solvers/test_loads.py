@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 
 import warpcloth as wc
 from support import setups
-from support.rows import slow_but
-from support.setups import MAIN, allocations, square
-from warpcloth.fast.plan import plan
+from support.energies import energy_and_gradient
+from support.layers import positions
+from support.rows import table
+from support.setups import MAIN, allocated, square
+from support.steps import after_frames
 
 SOLVERS = {name: replace(solver, substeps=8) for name, solver in setups.SOLVERS.items()}
 NONE = (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"]))
+@table("name", ("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"])
 def test_forces_in_proportion_to_masses_are_gravity(name, device):
     """Residuals are relative to it or to the forces over the masses, which is the same; the rest is rounding."""
     down = square(solver=SOLVERS[name], pins="corners")
@@ -47,10 +48,8 @@ def pushed(keyframes=PULSE):
 
 @pytest.mark.parametrize("name", TAKEN)
 def test_keyframes_of_forces_are_impulses(name, device):
-    """Linear between keyframes and constant after the last: v = Σ h f(t + c h)/m. Their work is Σ f·Δx.
-
-    Where a step takes its forces at its end, f is the mean of both ends, so that the work is of second order.
-    """
+    """Linear between keyframes and constant after the last: v = Σ h f(t + c h)/m. Their work is Σ f·Δx."""
+    # Where a step takes its forces at its end, f is the mean of both ends, so that the work is of second order.
     solver, ahead = TAKEN[name]
     run = wc.simulate(pushed(), solver, device=device, dtype="float64", frames=5, record="energies")
 
@@ -98,34 +97,23 @@ def test_a_pressure_that_bursts_a_sheet_has_no_rest_shape(device):
     """The tension of stretched springs grows with their length, as the force of the pressure does; with 1000 Pa that wins."""
     sheet = wc.Mesh.grid(9, 9, pattern="alternating")
     given = {"density": 0.1, "terms": [wc.Spring(stiffness=100.0)], "pins": "boundary", "gravity": NONE}
-    found = [
-        wc.equilibrium(wc.Scene(sheet, loads=[wc.Pressure(vertices="all", pressure=p)], **given), device=device)
-        for p in (200.0, 1000.0)
-    ]
-    assert found[0].status.ok and found[0].points[:, 1].max() > 0.3
-    assert not found[1].status.ok and not found[1].stable
-
-
-def balloon(pressure, **given):
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    term = wc.NeoHookeanMembrane(stiffness=500.0)
-    mesh = wc.Mesh(ball.vertices, ball.faces)
-    return wc.Scene(mesh, density=0.1, terms=[term], loads=[wc.Pressure(vertices="all", pressure=pressure, **given)])
+    loads = [[wc.Pressure(vertices="all", pressure=p)] for p in (200.0, 1000.0)]
+    held, burst = (wc.equilibrium(wc.Scene(sheet, loads=each, **given), device=device) for each in loads)
+    assert held.status.ok and held.points[:, 1].max() > 0.3 and not burst.status.ok and not burst.stable
 
 
 def test_a_balloon_balances_its_pressure(device):
     """At rest p δV = δU of any move: x·∇U = 3 p V of a growth, and p ∂V/∂x = ∂U/∂x at each vertex."""
-    scene = replace(balloon(400.0), gravity=NONE, pins=[0])
+    ball, terms = trimesh.creation.icosphere(subdivisions=2, radius=0.1), [wc.NeoHookeanMembrane(stiffness=500.0)]
+    fields = {"loads": [wc.Pressure(vertices="all", pressure=400.0)], "gravity": NONE, "pins": [0]}
+    scene = wc.Scene(wc.Mesh(ball.vertices, ball.faces), density=0.1, terms=terms, **fields)
     rest = wc.equilibrium(scene, device=device, tolerance=1e-10)
     assert rest.status.ok
     a, b, c = np.moveaxis(rest.points[scene.mesh.triangles], 1, 0)
     slopes = np.zeros_like(rest.points)
     for corner, slope in zip(scene.mesh.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True):
         np.add.at(slopes, corner, slope / 6.0)
-    model = replace(scene, loads=()).build(device=device, dtype="float64")
-    gradient = model.vectors()
-    plan(model).gradient().add(model.array(rest.points, model.vec3), gradient)
-    stress = gradient.numpy()
+    _, stress = energy_and_gradient(replace(scene, loads=()).build(device=device, dtype="float64"), rest.points)
     volume = (a * np.cross(b, c)).sum() / 6.0
     assert volume > 1.05 * 4.0 / 3.0 * np.pi * 0.1**3
     np.testing.assert_allclose(stress, 400.0 * slopes, rtol=0.0, atol=1e-6 * np.abs(400.0 * slopes).max())
@@ -165,12 +153,10 @@ def test_loads_vary_in_a_batch(name, device):
         loads = [replace(scene.loads[0], keyframes=keyframes[copy]), replace(pull, force=forces[copy])]
         alone = wc.simulate(replace(scene, loads=loads), solver, **run).points
         np.testing.assert_allclose(batch[:, copy], alone, rtol=0.0, atol=1e-11)
-    model = scene.build(device=device, dtype="float64", copies=3, vary=vary, order=np.arange(25)[::-1])
-    stepper = solver.bind(model)
-    for _ in range(4):
-        stepper.frame()
     if name != "xpbd":  # whose sweeps go in the order of elements
-        found = model.in_scene_order(stepper.state.x.numpy()).reshape(3, 25, 3)
+        order = {"copies": 3, "vary": vary, "order": np.arange(25)[::-1]}
+        stepper = after_frames(scene, solver, 4, device=device, dtype="float64", **order)
+        found = stepper.model.in_scene_order(stepper.state.x.numpy()).reshape(3, 25, 3)
         np.testing.assert_allclose(found, batch[-1], rtol=0.0, atol=1e-9)
     if device == "cpu":
         shared = wc.simulate(scene, solver, copies=3, vary=vary, threads=2, **run).points
@@ -179,25 +165,16 @@ def test_loads_vary_in_a_batch(name, device):
 
 @pytest.mark.parametrize("name", ["explicit", "newton", "xpbd"])
 def test_steps_with_loads_allocate_nothing(name, device):
-    stepper = SOLVERS[name].bind(sail().build(device=device, dtype="float64"))
-    stepper.step()
-    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
-        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1, "the tracker sees an allocation"
-        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+    stepper = after_frames(sail(), SOLVERS[name], steps=1, device=device, dtype="float64")
+    assert allocated(lambda: [stepper.step() for _ in range(10)], device) == 0
 
 
 @pytest.mark.parametrize("name", ["explicit", "newton midpoint", "xpbd"])
 def test_a_reset_and_a_copied_state_start_loads_again(name, device):
-    stepper = SOLVERS[name].bind(sail().build(device=device, dtype="float64"))
-
-    def run():
-        for _ in range(3):
-            stepper.frame()
-        return stepper.state.x.numpy().copy()
-
-    first = run()
+    stepper = after_frames(sail(), SOLVERS[name], 3, device=device, dtype="float64")
+    first = stepper.state.x.numpy().copy()
     stepper.reset()
-    assert (run() == first).all()
+    assert (list(positions(stepper, 3))[-1] == first).all()
 
 
 @pytest.mark.parametrize("name", ["explicit", "newton"])
@@ -205,12 +182,10 @@ def test_what_loads_drive_has_not_diverged(name, device):
     """A sheet that nothing holds is blown away; with steps above the limit it is still noticed."""
     push = wc.Force(vertices="all", force=(0.0, 0.0, 0.5))
     blown = replace(sail(), pins=None, gravity=NONE, loads=[push, wc.Pressure(vertices="all", pressure=30.0)], duration=2.0)
-    run = wc.simulate(blown, SOLVERS[name], device=device)
-    assert run.status.ok
-    swung = np.zeros((61, 3))
-    swung[:, 0] = 3.0 * np.sin(0.5 * np.arange(61))
-    run = wc.simulate(replace(sail(), loads=[wc.Force(vertices="x > 0.5", keyframes=swung)], duration=2.0), SOLVERS[name])
-    assert run.status.ok
+    assert wc.simulate(blown, SOLVERS[name], device=device).status.ok
+    swung = np.outer(3.0 * np.sin(0.5 * np.arange(61)), [1.0, 0.0, 0.0])
+    swinging = replace(sail(), loads=[wc.Force(vertices="x > 0.5", keyframes=swung)], duration=2.0)
+    assert wc.simulate(swinging, SOLVERS[name]).status.ok
 
 
 def test_an_exploding_run_with_loads_is_noticed(device):
@@ -228,10 +203,8 @@ def test_constant_forces_cost_no_launch_and_no_loads_cost_nothing(name, device):
     scenes["force"] = square(loads=[wc.Force(vertices=[7], force=(1.0, 0.0, 0.0))])
     scenes["pressure"] = square(loads=[wc.Pressure(vertices="all", pressure=1.0)])
     for key, scene in scenes.items():
-        scene = replace(scene, terms=scene.terms[:1])
-        model = scene.build(device=device)
-        stepper = SOLVERS[name].bind(model)
-        before = model.launches[0]
+        model = replace(scene, terms=scene.terms[:1]).build(device=device)
+        stepper, before = SOLVERS[name].bind(model), model.launches[0]
         stepper.integrator.launch_prediction() if stepper.integrator else stepper.launch_steps(1)
         launches[key] = model.launches[0] - before
         assert ("set_loads" in str(model.report())) == (key in ("force", "pressure"))

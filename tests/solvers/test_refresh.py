@@ -7,8 +7,9 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
-from support.rows import slow_but
+from support.rows import table
 from support.setups import MAIN, SOLVERS
+from support.steps import after_frames
 from warpcloth.terms.refresh import EVALUATION, STEP, Refresh
 
 LIFT = 0.05
@@ -58,29 +59,16 @@ class Floor(wc.Attachment):
 
 
 def scene(term, positions=MESH.points, velocities=((0.4, 0.1, -0.3), (0.0, 0.0, 0.0))):
-    return wc.Scene(
-        MESH,
-        masses=[2.0, 1.0],
-        positions=positions,
-        velocities=velocities,
-        terms=[term],
-        pins=[1],
-        gravity=(0.0, 0.0, 0.0),
-        fps=100.0,
-        duration=0.1,
-    )
+    fields = {"terms": [term], "pins": [1], "gravity": (0.0, 0.0, 0.0), "fps": 100.0, "duration": 0.1}
+    return wc.Scene(MESH, masses=[2.0, 1.0], positions=positions, velocities=velocities, **fields)
 
 
 def state_after(steps, solver, scene, device):
-    stepper = solver.bind(scene.build(device=device, dtype="float64"))
-    for _ in range(steps):
-        stepper.step()
+    stepper = after_frames(scene, solver, steps=steps, device=device, dtype="float64")
     return stepper.state.x.numpy().copy(), stepper.state.v.numpy().copy()
 
 
-@pytest.mark.parametrize(
-    "name", slow_but(("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint"])
-)  # BDF2 looks back beyond a restart
+@table("name", ("explicit", "newton midpoint", "xpbd"), [*MAIN, "newton midpoint"])
 def test_a_step_begins_with_what_is_refreshed(name, device):
     """Three steps are those of three scenes whose spring was declared where each begins."""
     solver = SOLVERS[name]
@@ -90,12 +78,11 @@ def test_a_step_begins_with_what_is_refreshed(name, device):
         target = expected[0][:1] + np.array([0.0, LIFT, 0.0])
         step = scene(wc.Attachment(vertices=[0], targets=target, stiffness=50.0), *expected)
         expected = state_after(1, solver, step, device)
-    assert np.abs(x - expected[0]).max() < 1e-14
-    assert np.abs(v - expected[1]).max() < 1e-12
+    assert np.abs(x - expected[0]).max() < 1e-14 and np.abs(v - expected[1]).max() < 1e-12
     assert x[0, 1] > MESH.points[0, 1] + 0.03 * 0.1 + 1e-5, "the spring pulls"
 
 
-@pytest.mark.parametrize("name", slow_but(("explicit", "newton", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"]))
+@table("name", ("explicit", "newton", "xpbd"), [*MAIN, "newton midpoint", "newton bdf2"])
 def test_an_evaluation_has_what_is_refreshed(name, device):
     """A target that follows the vertex sideways pulls it down alone, as far as one that is where it must be from the first."""
     solver, h = SOLVERS[name], 0.01

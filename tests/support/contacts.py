@@ -1,8 +1,12 @@
 """What the pairs of self-contact give at any positions."""
 
+import warp as wp
+
 import warpcloth as wc
 from warpcloth.contact.self_steps import SelfSteps
+from warpcloth.core.hessian import Hessian
 from warpcloth.core.sums import Sums
+from warpcloth.kernels.term import HessianPolicy
 
 
 def pairs_of(scene, device, bounded=False, h=1.0 / 24.0, dtype="float64", **build):
@@ -37,6 +41,16 @@ def gradient(pairs, x, term=None):
     out = pairs.model.vectors()
     (term or pairs.forces).add_gradient(out)
     return out.numpy()
+
+
+def hessian_times(pairs, x, p):
+    """The raw ∂²U/∂x² times p (N, 3) at x (N, 3), and the Hessian, of the step that was begun last."""
+    model = pairs.model
+    hessian, out = Hessian(model, HessianPolicy.RAW, terms=[], dynamic=pairs.forces.terms), model.vectors()
+    hessian.prepare()
+    hessian.assemble(model.array(x, model.vec3), 0.0)
+    hessian.multiply(model.array(p, model.vec3), out, wp.ones(1, dtype=wp.int32, device=model.device))
+    return out.numpy(), hessian
 
 
 def slope_of(f, pairs, x, direction, eta, **given):

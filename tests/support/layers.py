@@ -108,13 +108,3 @@ def positions(stepper, frames):
     for _ in range(frames):
         stepper.frame()
         yield stepper.state.x.numpy().copy()
-
-
-def after_frames(scene, solver, frames=0, steps=0, **build):
-    """A stepper after some frames, and steps more."""
-    stepper = solver.bind(scene.build(**build))
-    for _ in range(frames):
-        stepper.frame()
-    for _ in range(steps):
-        stepper.step()
-    return stepper

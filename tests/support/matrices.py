@@ -1,6 +1,7 @@
 """Classes of random 3×3 matrices, and how far a decomposition of them is from what it should be."""
 
 import numpy as np
+from scipy.sparse import bsr_array
 
 
 def rotations(rng, n):
@@ -140,3 +141,10 @@ def reconstruction(A, *factors):
 def times(U, S):
     """U diag(S) in float64."""
     return U.astype(np.float64) * S.astype(np.float64)[:, None, :]
+
+
+def block_matrix(matrix):
+    """The dense matrix of 3 × 3 blocks on the device, by its offsets, columns and values."""
+    offsets = matrix.offsets.numpy()
+    columns, values = (each.numpy()[: offsets[-1]] for each in (matrix.columns, matrix.values))
+    return bsr_array((values, columns, offsets), shape=(3 * len(offsets) - 3,) * 2).toarray()

@@ -1,6 +1,7 @@
 """Small meshes that several tests need."""
 
 import numpy as np
+from scipy.spatial import Delaunay
 
 import warpcloth as wc
 
@@ -39,3 +40,27 @@ def joined(*parts):
     firsts = np.cumsum([0, *(len(points) for points, _ in parts)])
     triangles = [triangles + first for (_, triangles), first in zip(parts, firsts, strict=False)]
     return np.concatenate([points for points, _ in parts]), np.concatenate(triangles)
+
+
+def delaunay(points):
+    """A flat mesh of points (n, 2) in x and z, without the slivers on the outline."""
+    triangles = Delaunay(points).simplices
+    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
+    areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    return wc.Mesh(np.insert(points, 1, 0.0, axis=1), triangles[areas > 1e-3 * np.median(areas)])
+
+
+def rolled(points, radius, degrees=0.0):
+    """Rolled up along the direction at an angle to x, (n, 3): an isometry of the plane y = 0."""
+    across, up = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))]), np.array([0.0, 1.0, 0.0])
+    along, arc = np.cross(across, up), (points @ across)[:, None]
+    return radius * (np.sin(arc / radius) * across + (1.0 - np.cos(arc / radius)) * up) + (points @ along)[:, None] * along
+
+
+def irregular(nx=7, ny=6, size=1.0):
+    """A flat jittered sheet in the plane y = 0; its outline stays a rectangle."""
+    grid = wc.Mesh.grid(nx, ny, size=size, pattern="alternating")
+    jitter = np.random.default_rng(0).uniform(-0.25, 0.25, (nx * ny, 3)) * np.divide(size, (nx - 1, ny - 1)).mean()
+    jitter[:, 1] = 0.0
+    jitter[grid.boundary] = 0.0
+    return wc.Mesh(grid.points + jitter, grid.triangles)

@@ -3,6 +3,8 @@
 import io
 import re
 
+import warp as wp
+
 import warpcloth as wc
 
 SOLVERS = {
@@ -72,3 +74,10 @@ def allocations(tracker, work):
     del keep
     found = re.search(r"Total allocations:\s+\S+\s+(\d+)", report.getvalue())
     return int(found[1]) if found else 0
+
+
+def allocated(work, device):
+    """The same, with a check that the tracker sees an allocation."""
+    with wp.ScopedMemoryTracker("work", print=False) as tracker:
+        assert allocations(tracker, lambda: wp.zeros(3, device=device)) == 1
+        return allocations(tracker, work)

@@ -8,23 +8,24 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.meshes import PAIR
 from support.scenes import scene
 from warpcloth.core.energy import Energy
+from warpcloth.core.gradient import Gradient
 from warpcloth.core.sums import Sums
 from warpcloth.solvers.projective_dynamics import ACCELERATIONS
 
 HANGING_PAIR = wc.Mesh(np.array([[0.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), edges=[[0, 1]])
 
 
-def hanging_mass(k, m, stretched, fps=60.0):
-    return wc.Scene(
-        HANGING_PAIR,
-        masses=[m, m],
-        positions=[[0.0, 0.0, 0.0], [0.0, -1.0 - stretched, 0.0]],
-        terms=[wc.Spring(stiffness=k)],
-        pins=[0],
-        fps=fps,
-    )
+def spring(x=(1.0, 0.0, 0.0), k=100.0, m=1.0, mesh=PAIR, **fields):
+    """A spring of length 1 along the x axis from a pin at the origin to a mass at x, by default without gravity."""
+    given = {"masses": [m, m], "positions": [(0.0, 0.0, 0.0), x], "pins": [0], "gravity": (0.0, 0.0, 0.0)}
+    return wc.Scene(mesh, terms=[wc.Spring(stiffness=k)], **given | fields)
+
+
+def hanging_mass(k, m, stretched):
+    return spring((0.0, -1.0 - stretched, 0.0), k, m, HANGING_PAIR, gravity=(0.0, -9.81, 0.0), fps=60.0)
 
 
 @cache
@@ -44,15 +45,24 @@ METHODS = {
 }
 
 
-def after_one_step(declared, solver, device, dtype="float64", **build):
-    """x after a step [m], and the stepper."""
-    stepper = solver.bind(declared.build(device=device, dtype=dtype, **build))
-    stepper.step()
+def after_frames(declared, solver, frames=0, steps=0, **build):
+    """A stepper after some frames, and steps more."""
+    stepper = solver.bind(declared.build(**build))
+    for _ in range(frames):
+        stepper.frame()
+    for _ in range(steps):
+        stepper.step()
+    return stepper
+
+
+def after_steps(declared, solver, device, dtype="float64", steps=1, **build):
+    """x after some steps [m], and the stepper."""
+    stepper = after_frames(declared, solver, steps=steps, device=device, dtype=dtype, **build)
     return stepper.state.x.numpy().astype(np.float64), stepper
 
 
 def newton_step(declared, device):
-    return after_one_step(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)[0]
+    return after_steps(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)[0]
 
 
 def objective(declared, x, device):
@@ -63,6 +73,22 @@ def objective(declared, x, device):
     predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
     moved = np.where(model.inverse_mass.numpy()[:, None] > 0.0, x - predicted, 0.0)
     return 0.5 / h**2 * float((declared.vertex_masses[:, None] * moved**2).sum()) + float(U.numpy()[0])
+
+
+def strains(declared, x):
+    """Of the springs of a scene."""
+    pairs = declared.terms[0].stencil(declared.mesh)
+    rest = declared.terms[0].rest(declared.mesh, None, pairs)[:, 0]
+    return np.linalg.norm(x[pairs[:, 1]] - x[pairs[:, 0]], axis=1) / rest - 1.0
+
+
+def unbalanced(declared, x, device):
+    """‖(x − x̃)/h² + ∇U/m‖ over g after a step of implicit Euler of a frame, the largest of any vertex that moves."""
+    model, h = declared.build(device=device, dtype="float64"), 1.0 / declared.fps
+    gradient, w = model.vectors(), model.inverse_mass.numpy()[:, None]
+    Gradient(model).add(model.array(x, model.vec3), gradient)
+    predicted = declared.positions + h * declared.velocities + h**2 * declared.gravity
+    return np.linalg.norm(np.where(w > 0.0, (x - predicted) / h**2 + w * gradient.numpy(), 0.0), axis=1).max() / 9.81
 
 
 def stopped_and_resumed(frame, declared, solver, **run):

@@ -9,9 +9,11 @@ import warp as wp
 from pxr import Usd, UsdGeom
 
 import warpcloth as wc
+from support.continuum import turn
 from support.energies import energy_and_gradient
-from support.rows import slow_but
-from support.setups import allocations
+from support.rows import table
+from support.setups import allocated
+from support.steps import after_frames, after_steps
 from support.usd_validation import validate
 from warpcloth.core.status import Result
 from warpcloth.numerics.constraints import Constraints
@@ -30,6 +32,7 @@ BODIES = {
     "pair": [[0.0, 0, 0], [1.0, 0, 0]],
 }
 each_body = pytest.mark.parametrize("name", BODIES)
+Z = (0.0, 0.0, 1.0)
 
 
 def vertices(points):
@@ -78,9 +81,7 @@ def test_rigid_motion_costs_nothing(name, dtype, device):
     rest, eps = np.array(BODIES[name]), np.finfo(dtype).eps
     model = body(rest, stiffness=1.0).build(device=device, dtype=dtype)
     for angle in (0.1, 2.0, np.pi):
-        c, s = np.cos(angle), np.sin(angle)
-        x = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).T + [0.0, 0.0, 8.0]
-        _, gradient = energy_and_gradient(model, x)
+        _, gradient = energy_and_gradient(model, rest @ turn(Z, angle).T + [0.0, 0.0, 8.0])
         assert np.abs(gradient).max() < 16 * eps * 8.0 * 3.0
 
 
@@ -116,9 +117,8 @@ def test_one_sweep_makes_a_body_rigid(name, sweep, device):
     rest = np.array(BODIES[name])
     x = rest + 0.2 * np.random.default_rng(1).normal(size=rest.shape)
     scene = body(rest, positions=x)
-    stepper = wc.PBD(substeps=1, iterations=1, sweep=sweep).bind(scene.build(device=device, dtype="float64"))
-    stepper.step()
-    after, mass = stepper.state.x.numpy(), scene.vertex_masses[:, None]
+    after, _ = after_steps(scene, wc.PBD(substeps=1, iterations=1, sweep=sweep), device)
+    mass = scene.vertex_masses[:, None]
     assert np.abs(after - best_fit(rest, x, scene.vertex_masses)).max() < 32 * EPS
     assert np.abs((mass * (after - x)).sum(axis=0)).max() < 64 * EPS
     assert np.abs(np.cross(x, mass * (after - x)).sum(axis=0)).max() < 64 * EPS
@@ -128,10 +128,8 @@ def test_one_sweep_makes_a_body_rigid(name, sweep, device):
 def test_rows_are_what_no_rigid_motion_takes_up(name, device):
     """J = (I − Q)√M at a turned rest shape: central differences of √m(x − c − R q), its transpose, its matrix and its rank."""
     rest = np.array(BODIES[name])
-    c, s = np.cos(2.0), np.sin(2.0)
-    x = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).T + [0.0, 0.0, 8.0]
-    scene = body(rest, positions=x, stiffness=50.0)
-    model = scene.build(device=device, dtype="float64")
+    x = rest @ turn(Z, 2.0).T + [0.0, 0.0, 8.0]
+    model = body(rest, positions=x, stiffness=50.0).build(device=device, dtype="float64")
     constraints, still = Constraints(model, 1 / 60, False), model.vectors()
 
     def gap(places):
@@ -162,88 +160,64 @@ def test_rows_are_what_no_rigid_motion_takes_up(name, device):
 def test_two_bars_hinge_at_a_shared_vertex(solver, device):
     """Free in space and folding: both keep their lengths, the angle changes, linear momentum stays to rounding."""
     rest = np.array([[-1.0, 0, 0], [-0.5, 0, 0], [0, 0, 0], [0.5, 0, 0], [1.0, 0, 0]])
-    scene = wc.Scene(
-        vertices(rest),
-        masses=np.ones(5),
-        velocities=np.outer(np.abs(rest[:, 0]), [0.0, 1.0, 0.0]),
-        terms=[wc.RigidCluster(vertices=[[0, 1, 2], [2, 3, 4]])],
-        gravity=(0.0, 0.0, 0.0),
-        fps=240.0,
-    )
-    stepper = replace(solver, iterations=60).bind(scene.build(device=device, dtype="float64"))
-    momentum = scene.velocities.sum(axis=0)
-    for _ in range(240):
-        stepper.step()
-    x, v = stepper.state.x.numpy(), stepper.state.v.numpy()
+    velocities, terms = np.outer(np.abs(rest[:, 0]), [0.0, 1.0, 0.0]), [wc.RigidCluster(vertices=[[0, 1, 2], [2, 3, 4]])]
+    scene = replace(body(rest, np.ones(5), velocities=velocities, fps=240.0), terms=terms)
+    x, stepper = after_steps(scene, replace(solver, iterations=60), device, steps=240)
     assert np.abs(np.linalg.norm(x[[0, 1, 3, 4]] - x[2], axis=1) - [1.0, 0.5, 0.5, 1.0]).max() < 1e-9
     # A move is rounded to ε|x|, and over h it is a velocity.
-    assert np.abs(v.sum(axis=0) - momentum).max() < 240 * 60 * EPS * 240
+    assert np.abs((stepper.state.v.numpy() - velocities).sum(axis=0)).max() < 240 * 60 * EPS * 240
     a, b = x[0] - x[2], x[4] - x[2]
     assert np.dot(a, b) > -0.5, "it has folded"
-
-
-def pendulum(**scene):
-    """A rigid bar of three vertices that swings about its pinned first one from 0.05 rad."""
-    rest, angle = np.array([[0.0, 0, 0], [0, -0.5, 0], [0, -1.0, 0]]), 0.05
-    c, s = np.cos(angle), np.sin(angle)
-    x = rest @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]).T
-    return body(rest, masses=[0.0, 1.0, 2.0], positions=x, pins=[0], gravity=(0.0, -9.81, 0.0), **scene)
 
 
 @pytest.mark.parametrize("solver", [wc.XPBD(substeps=1, iterations=4), wc.ConstrainedDynamics(substeps=1, tolerance=1e-9)])
 def test_a_compound_pendulum_has_its_period(solver, device):
     """ω = √(m g d/I), I = Σ m r²: the angle after 0.5 s tends to 0.05 cos ωt (a part of 0.05²/16 slower), at order 1."""
     omega = np.sqrt(9.81 * (1.0 * 0.5 + 2.0 * 1.0) / (1.0 * 0.25 + 2.0 * 1.0)) * (1.0 - 0.05**2 / 16)
-    errors = []
+    rest, errors = np.array([[0.0, 0, 0], [0, -0.5, 0], [0, -1.0, 0]]), []
+    fields = {"positions": rest @ turn(Z, 0.05).T, "pins": [0], "gravity": (0.0, -9.81, 0.0), "fps": 20.0}
     for substeps in (10, 20, 40):
-        stepper = replace(solver, substeps=substeps).bind(pendulum(fps=20.0).build(device=device, dtype="float64"))
-        for _ in range(10 * substeps):
-            stepper.step()
-        x = stepper.state.x.numpy()[2]
+        scene = body(rest, masses=[0.0, 1.0, 2.0], **fields)
+        x = after_steps(scene, replace(solver, substeps=substeps), device, steps=10 * substeps)[0][2]
         errors.append(abs(np.arctan2(x[0], -x[1]) - 0.05 * np.cos(omega * 0.5)))
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.15)
-    assert np.log2(errors[1] / errors[2]) == pytest.approx(1.0, abs=0.15)
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx(1.0, abs=0.15)
+
+
+KAPPA = 2000.0
+HUNG = body([[0.0, 0, 0], [0, -1.0, 0]], masses=[0.0, 3.0], stiffness=KAPPA, pins=[0], gravity=(0, -9.81, 0))
 
 
 @pytest.mark.parametrize(("substeps", "iterations"), [(1, 1), (4, 1), (1, 10)])
 def test_a_soft_body_hangs_as_deep_as_its_stiffness_says(substeps, iterations, device):
-    """XPBD, whatever step and iterations: a vertex below a pinned one of weight 1000 comes to rest 1.001 g/κ lower.
+    """XPBD, whatever step and iterations: a vertex below a pinned one of weight 1000 comes to rest 1.001 g/κ lower."""
+    x, stepper = after_steps(HUNG, wc.XPBD(substeps=substeps, iterations=iterations), device, steps=600 * substeps)
+    left = 1.01e-3 * 9.81 * stepper.h**2 if iterations == 1 else 1e-9  # an iteration leaves a thousandth of what it moves, gh²
+    assert -1.0 - x[1, 1] == pytest.approx(1.001 * 9.81 / KAPPA, abs=left)
 
-    A single iteration leaves a thousandth of what it moves, gh².
-    """
-    kappa = 2000.0
-    scene = body([[0.0, 0, 0], [0, -1.0, 0]], masses=[0.0, 3.0], stiffness=kappa, pins=[0], gravity=(0, -9.81, 0))
-    stepper = wc.XPBD(substeps=substeps, iterations=iterations).bind(scene.build(device=device, dtype="float64"))
-    for _ in range(600 * substeps):
-        stepper.step()
-    assert -1.0 - stepper.state.x.numpy()[1, 1] == pytest.approx(
-        1.001 * 9.81 / kappa, abs=1.01e-3 * 9.81 * stepper.h**2 if iterations == 1 else 1e-9
-    )
+
+def test_a_soft_body_comes_to_rest_where_it_hangs(device):
+    """The rest shape: a vertex below a pinned one of weight 1000 hangs 1.001 g/κ lower."""
+    found = wc.equilibrium(HUNG, device=device)
+    assert found.status.result is Result.CONVERGED
+    assert -1.0 - found.points[1, 1] == pytest.approx(1.001 * 9.81 / KAPPA, rel=1e-7)
 
 
 def test_a_soft_body_swings_with_its_frequency(device):
     """Two masses: each is κmᵢtᵢ away from its place, so that their distance obeys ë = −κe; and the explicit limit is 2/√κ."""
     kappa, h = 100.0, 1e-3
     scene = body([[0.0, 0, 0], [1.0, 0, 0]], masses=[1.0, 2.0], positions=[[0, 0, 0], [1.1, 0, 0]], stiffness=kappa, fps=1 / h)
-    model = scene.build(device=device, dtype="float64")
-    assert step_limits(model)[0] == pytest.approx(2.0 / np.sqrt(kappa), rel=1e-9)
-    stepper = wc.Explicit(substeps=1).bind(model)
-    for _ in range(1000):
-        stepper.step()
-    x = stepper.state.x.numpy()
+    x, stepper = after_steps(scene, wc.Explicit(substeps=1), device, steps=1000)
+    assert step_limits(stepper.model)[0] == pytest.approx(2.0 / np.sqrt(kappa), rel=1e-9)
     assert np.linalg.norm(x[1] - x[0]) - 1.0 == pytest.approx(0.1 * np.cos(np.sqrt(kappa)), abs=0.1 * np.sqrt(kappa) * h)
 
 
+CONSTRAINED = wc.ConstrainedDynamics(substeps=1, tolerance=1e-11, iterations=100)
 SOFT = {
     "newton": wc.Newton(substeps=1, tolerance=1e-11, iterations=10_000),
-    "projective dynamics": wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=10_000),
-    "projective dynamics matrix-free": wc.ProjectiveDynamics(
-        substeps=1, tolerance=1e-11, iterations=10_000, acceleration="none", linear="jacobi"
-    ),
+    "projective dynamics": (PD := wc.ProjectiveDynamics(substeps=1, tolerance=1e-11, iterations=10_000)),
+    "projective dynamics matrix-free": replace(PD, acceleration="none", linear="jacobi"),
     **{
-        f"constrained dynamics {safe} {linear}": wc.ConstrainedDynamics(
-            substeps=1, tolerance=1e-11, iterations=100, stabilisation=safe, linear=linear
-        )
+        f"constrained dynamics {safe} {linear}": replace(CONSTRAINED, stabilisation=safe, linear=linear)
         for safe in ("geometric-stiffness", "line-search")
         for linear in ("cg", "factorised")
     },
@@ -255,27 +229,20 @@ SOFT = {
 
 def jelly(**scene):
     """Two soft bodies that share a vertex and a cloth's worth of springs, thrown."""
-    mesh, rng = wc.Mesh.grid(4, 4, pattern="alternating"), np.random.default_rng(3)
-    terms = [
-        wc.RigidCluster(vertices=[[0, 1, 4, 5, 6], [6, 7, 10, 11, 15]], stiffness=[2e3, 5e3]),
-        wc.Spring(stiffness=50.0),
-    ]
-    velocities = rng.normal(size=(16, 3))
+    mesh, velocities = wc.Mesh.grid(4, 4, pattern="alternating"), np.random.default_rng(3).normal(size=(16, 3))
+    clusters = wc.RigidCluster(vertices=[[0, 1, 4, 5, 6], [6, 7, 10, 11, 15]], stiffness=[2e3, 5e3])
+    terms = [clusters, wc.Spring(stiffness=50.0)]
     return wc.Scene(mesh, density=1.0, terms=terms, velocities=velocities, pins=[0], **scene)
 
 
-@pytest.mark.parametrize("integrator", slow_but(["bdf2"], ["euler", "midpoint", "bdf2"]))
+@table("integrator", ["bdf2"], ["euler", "midpoint", "bdf2"])
 def test_soft_bodies_meet_at_one_minimiser(integrator, device):
     """After three steps all who minimise are where Newton is, to 1e-8 m; vector XPBD as its fixed point is implicit Euler."""
-    ends = {}
+    newton, _ = after_steps(jelly(), replace(SOFT["newton"], integrator=integrator), device, steps=3)
     for name, solver in SOFT.items():
-        stepper = replace(solver, integrator=integrator).bind(jelly().build(device=device, dtype="float64"))
-        for _ in range(3):
-            stepper.step()
-        ends[name] = stepper.state.x.numpy()
+        x, stepper = after_steps(jelly(), replace(solver, integrator=integrator), device, steps=3)
         assert "xpbd" in name or stepper.results == [Result.CONVERGED], name
-    for name, x in ends.items():
-        assert np.abs(x - ends["newton"]).max() < 1e-8, name
+        assert np.abs(x - newton).max() < 1e-8, name
 
 
 @pytest.mark.parametrize("iterations", [1, 5, 40])
@@ -283,22 +250,11 @@ def test_pbd_per_step_moves_a_soft_body_alike(iterations, device):
     """The part 1/(1 + α̃) of the way to its shape, α̃ = 1/(κh²), whatever the iterations, and its centre not at all."""
     rest, kappa = np.array(BODIES["solid"]), 3000.0
     x = rest + 0.2 * np.random.default_rng(1).normal(size=rest.shape)
-    scene = body(rest, positions=x, stiffness=kappa)
-    solver = wc.PBD(substeps=1, iterations=iterations, correction="per-step")
-    stepper = solver.bind(scene.build(device=device, dtype="float64"))
-    stepper.step()
+    scene, solver = body(rest, positions=x, stiffness=kappa), wc.PBD(substeps=1, iterations=iterations, correction="per-step")
+    after, stepper = after_steps(scene, solver, device)
     part = 1.0 / (1.0 + 1.0 / (kappa * stepper.h**2))
     expected = x + part * (best_fit(rest, x, scene.vertex_masses) - x)
-    assert np.abs(stepper.state.x.numpy() - expected).max() < 4 * iterations * 16 * EPS
-
-
-def test_a_soft_body_comes_to_rest_where_it_hangs(device):
-    """The rest shape: a vertex below a pinned one of weight 1000 hangs 1.001 g/κ lower."""
-    kappa = 2000.0
-    scene = body([[0.0, 0, 0], [0, -1.0, 0]], masses=[0.0, 3.0], stiffness=kappa, pins=[0], gravity=(0, -9.81, 0))
-    found = wc.equilibrium(scene, device=device)
-    assert found.status.result is Result.CONVERGED
-    assert -1.0 - found.points[1, 1] == pytest.approx(1.001 * 9.81 / kappa, rel=1e-7)
+    assert np.abs(after - expected).max() < 4 * iterations * 16 * EPS
 
 
 @pytest.mark.parametrize(
@@ -320,40 +276,28 @@ def test_copies_with_their_own_bodies(solver, device):
 
 @pytest.mark.parametrize("solver", [wc.PBD, wc.XPBD, wc.ConstrainedDynamics, wc.ProjectiveDynamics, wc.Explicit])
 def test_a_step_allocates_nothing(solver, device):
-    stepper = solver(substeps=1).bind(jelly(fps=240.0).build(device=device))
-    stepper.step()
-    with wp.ScopedMemoryTracker("steps", print=False) as tracker:
-        assert allocations(tracker, lambda: [stepper.step() for _ in range(10)]) == 0
+    stepper = after_frames(jelly(fps=240.0), solver(substeps=1), steps=1, device=device)
+    assert allocated(lambda: [stepper.step() for _ in range(10)], device) == 0
 
 
 def test_bodies_by_selections_are_those_by_indices(device):
-    texts = ["x == 0", "corners", "index(5, 6, 9)"]
-    listed = [jelly().mesh.select(text) for text in texts]
-    for bodies in (texts, tuple(texts), np.array(texts)):
-        one, other = (
-            replace(jelly(), terms=[wc.RigidCluster(vertices=given, stiffness=[1.0, 2.0, 3.0])]).build(device=device).terms[0]
-            for given in (bodies, listed)
-        )
-        assert all(
-            np.array_equal(a.numpy(), b.numpy())
-            for a, b in (
-                (one.stencil, other.stencil),
-                (one.cells.offsets, other.cells.offsets),
-                (one.stiffness, other.stiffness),
-            )
-        )
+    texts, found = ["x == 0", "corners", "index(5, 6, 9)"], []
+    for bodies in ([jelly().mesh.select(text) for text in texts], texts, tuple(texts), np.array(texts)):
+        cluster = wc.RigidCluster(vertices=bodies, stiffness=[1.0, 2.0, 3.0])
+        (made,) = replace(jelly(), terms=[cluster]).build(device=device).terms
+        found.append([each.numpy().tolist() for each in (made.stencil, made.cells.offsets, made.stiffness)])
+    assert found[1] == found[2] == found[3] == found[0]
 
 
 def test_two_cells_of_a_colour_share_no_vertex(device):
-    stepper = wc.PBD(substeps=1).bind(jelly().build(device=device))
-    assert len(stepper.sweep.ranges[0]) == 2
-    model = replace(jelly(), terms=[wc.RigidCluster(vertices=[[0, 1], [2, 3], [4, 5, 6], [0, 8]])]).build(
-        device=device, copies=2
-    )
-    (elements,), (ranges,) = (lambda sweep: (sweep.elements, sweep.ranges))(wc.PBD(substeps=1).bind(model).sweep)
-    assert ranges == [(0, 8)], "they share the pin alone"
-    model = replace(jelly(), pins=None, terms=model.scene.terms).build(device=device, copies=2)
-    (elements,), (ranges,) = (lambda sweep: (sweep.elements, sweep.ranges))(wc.PBD(substeps=1).bind(model).sweep)
+    def sweep_of(scene, copies=2):
+        return wc.PBD(substeps=1).bind(scene.build(device=device, copies=copies)).sweep
+
+    assert len(sweep_of(jelly(), 1).ranges[0]) == 2
+    sharing = replace(jelly(), terms=[wc.RigidCluster(vertices=[[0, 1], [2, 3], [4, 5, 6], [0, 8]])])
+    assert sweep_of(sharing).ranges == ([(0, 8)],), "they share the pin alone"
+    sweep = sweep_of(replace(sharing, pins=None))
+    (elements,), (ranges,) = sweep.elements, sweep.ranges
     offsets, found = elements.cells.offsets.numpy(), elements.stencil.numpy()[:, 0]
     assert sorted(map(len, np.split(found, offsets[1:-1]))) == [2] * 6 + [3] * 2
     for first, count in ranges:
@@ -367,32 +311,21 @@ def test_a_body_without_stiffness_is_not_there(linear, device):
     declared, rng = body(BODIES["solid"], stiffness=0.0), np.random.default_rng(0)
     spring = wc.Spring(pairs=[[0, 1], [0, 4]], stiffness=1e3, rest_lengths=0.7)
     velocities = rng.normal(size=declared.mesh.points.shape)
-    found = []
-    for terms in ([spring], [spring, *declared.terms]):
-        model = replace(declared, terms=terms, velocities=velocities).build(device=device, dtype="float64")
-        stepper = wc.ConstrainedDynamics(substeps=1, iterations=1, tolerance=1e-12, linear=linear).bind(model)
-        stepper.step()
-        found.append(stepper.state.x.numpy())
-    assert np.abs(found[1] - found[0]).max() < (1e-9 if linear == "cg" else 8 * EPS)
+    solver = wc.ConstrainedDynamics(substeps=1, iterations=1, tolerance=1e-12, linear=linear)
+    scenes = [replace(declared, terms=terms, velocities=velocities) for terms in ([spring], [spring, *declared.terms])]
+    without, found = (after_steps(scene, solver, device)[0] for scene in scenes)
+    assert np.abs(found - without).max() < (1e-9 if linear == "cg" else 8 * EPS)
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_degenerate_bodies(dtype, device):
     """One vertex, coincident ones, all pinned, one in another: nothing that is not finite, and the rest moves on."""
     points = np.array([[0.0, 0, 0], [0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [2.0, 1.0, 0], [5.0, 0, 0], [6.0, 0, 0]])
-    bodies = [[0], [0, 1], [2, 3, 4], [3, 4], [2, 3, 4, 1], [5, 6]]
-    scene = wc.Scene(
-        wc.Mesh(points, edges=[[2, 3]]),
-        masses=np.ones(7),
-        terms=[wc.RigidCluster(vertices=bodies)],
-        pins=[5, 6],
-        velocities=np.random.default_rng(0).normal(size=(7, 3)),
-    )
+    terms = [wc.RigidCluster(vertices=[[0], [0, 1], [2, 3, 4], [3, 4], [2, 3, 4, 1], [5, 6]])]
+    fields = {"pins": [5, 6], "velocities": np.random.default_rng(0).normal(size=(7, 3))}
+    scene = wc.Scene(wc.Mesh(points, edges=[[2, 3]]), masses=np.ones(7), terms=terms, **fields)
     for solver in (wc.PBD(substeps=2), wc.XPBD(substeps=2), wc.PBD(substeps=2, sweep="vertex-averaged")):
-        stepper = solver.bind(scene.build(device=device, dtype=dtype))
-        for _ in range(120):
-            stepper.step()
-        x = stepper.state.x.numpy()
+        x, _ = after_steps(scene, solver, device, dtype, steps=120)
         assert np.isfinite(x).all() and (x[5:] == points[5:].astype(dtype)).all()
         assert np.abs(x[:5].mean(axis=0)[1] - points[:5].mean(axis=0)[1]) > 1.0
 
@@ -415,8 +348,7 @@ def test_a_level_mobile_stays_level(device):
 
 @pytest.mark.parametrize(("ending", "single_file"), [("usda", False), ("usdc", True), ("usdz", False)])
 def test_the_file_of_a_mobile_has_its_bars_and_strings(tmp_path, ending, single_file):
-    path = str(tmp_path / f"mobile.{ending}")
-    scene = mobile.scene(n=3)
+    path, scene = str(tmp_path / f"mobile.{ending}"), mobile.scene(n=3)
     animation = wc.simulate(scene, wc.XPBD(substeps=20), output=path, frames=12, single_file=single_file)
     stage, eps = Usd.Stage.Open(path), np.finfo(np.float32).eps
     strings = sorted(map(list, scene.terms[1].pairs))
@@ -427,16 +359,14 @@ def test_the_file_of_a_mobile_has_its_bars_and_strings(tmp_path, ending, single_
         assert 0.0 < curves.GetWidthsAttr().Get()[0] < 0.03
         assert curves.GetPointsAttr().GetTimeSamples() == list(range(13))
         for code in (0, 12):
-            vertices = np.concatenate(lines)
-            shown = np.array(curves.GetPointsAttr().Get(code))
+            vertices, shown = np.concatenate(lines), np.array(curves.GetPointsAttr().Get(code))
             np.testing.assert_allclose(shown, animation.points[code][vertices], atol=eps)
             np.testing.assert_allclose(curves.GetVelocitiesAttr().Get(code), animation.velocities[code][vertices], atol=eps)
         assert np.abs(shown - np.array(curves.GetPointsAttr().Get(0))).max() > 0.05, "they move"
         low, high = np.array(curves.GetExtentAttr().Get(12))
         assert (low < shown.min(axis=0)).all() and (high > shown.max(axis=0)).all()
     # What measures the file finds the cloth, not its strings.
-    assert FrameSequence(path).shape == (13, len(scene.mesh.points), 3)
-    assert validate(path) == []
+    assert FrameSequence(path).shape == (13, len(scene.mesh.points), 3) and validate(path) == []
 
 
 def test_what_triangles_show_has_no_lines():
@@ -447,11 +377,8 @@ def test_what_triangles_show_has_no_lines():
 @pytest.mark.host
 def test_a_mobile_moves_alike_with_two_methods(device):
     """XPBD and constrained dynamics end 4e-5 m apart after a second, as far as XPBD with half the step does from itself."""
-    scene = mobile.scene(n=5)
-    ends = [
-        wc.simulate(scene, solver, device=device, dtype="float64", frames=60).points[-1]
-        for solver in (wc.XPBD(substeps=20, iterations=20), wc.ConstrainedDynamics(substeps=20))
-    ]
+    scene, solvers = mobile.scene(n=5), (wc.XPBD(substeps=20, iterations=20), wc.ConstrainedDynamics(substeps=20))
+    ends = [wc.simulate(scene, solver, device=device, dtype="float64", frames=60).points[-1] for solver in solvers]
     assert np.abs(ends[0][:7] - scene.mesh.points[:7]).max() > 0.1
     assert np.abs(ends[1][:7] - ends[0][:7]).max() < 1e-4
 

@@ -1,15 +1,15 @@
 """Membranes and limits on whole meshes: patch test, tension, recovery from any deformation, what limits keep."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import warp as wp
 
 import warpcloth as wc
-from support.energies import DENSITIES, FEW, eps, every_dtype, material_of, random_rotation
-from support.rows import slow_but
-from warpcloth.core.energy import Energy
-from warpcloth.core.gradient import Gradient
-from warpcloth.core.sums import Sums
+from support.energies import DENSITIES, FEW, energy_and_gradient, eps, every_dtype, material_of, random_rotation
+from support.meshes import irregular
+from support.rows import table
+from support.steps import after_steps
 from warpcloth.run.equilibrium import SETTLED
 from warpcloth.solvers.explicit import step_limits
 
@@ -23,15 +23,6 @@ def membrane(name, ratio, stiffness=STIFFNESS):
     return wc.terms.TERMS[name](stiffness=stiffness, **given), stiffness * mu, stiffness * lam
 
 
-def irregular(nx=7, ny=6, size=1.0, seed=0):
-    """A flat jittered sheet in the plane y = 0, about 1 m; its outline stays a rectangle."""
-    grid = wc.Mesh.grid(nx, ny, size=size, pattern="alternating")
-    jitter = np.random.default_rng(seed).uniform(-0.25, 0.25, (nx * ny, 3)) * np.divide(size, (nx - 1, ny - 1)).mean()
-    jitter[:, 1] = 0.0
-    jitter[grid.boundary] = 0.0
-    return wc.Mesh(grid.points + jitter, grid.triangles)
-
-
 def gradients(mesh, x):
     """F (T, 3, 2) of places x (n, 3), in the axes x and z of a flat mesh."""
     sides = [np.stack([p[mesh.triangles[:, i]] - p[mesh.triangles[:, 0]] for i in (1, 2)], axis=-1) for p in (mesh.points, x)]
@@ -43,21 +34,11 @@ def stretches(mesh, x):
     return np.linalg.svd(gradients(mesh, np.asarray(x, dtype=np.float64)), compute_uv=False)
 
 
-def energy_and_forces(scene, dtype, device):
-    """U [J] and ∂U/∂x (n, 3) [N] at the start of a scene."""
-    model = scene.build(device=device, dtype=dtype)
-    energy, gradient = wp.zeros(1, dtype=wp.float64, device=model.device), model.vectors()
-    Energy(model, Sums(model)).add(model.positions, energy)
-    Gradient(model).add(model.positions, gradient)
-    return energy.numpy()[0], gradient.numpy().astype(np.float64)
-
-
 @every_dtype
 @pytest.mark.parametrize("name", DENSITIES)
 def test_patch(name, dtype, device):
     """Under x = GX + b inner forces vanish and U = u(G)·area; rotating the whole leaves U and turns the forces."""
-    random = np.random.default_rng(1)
-    mesh = irregular()
+    random, mesh = np.random.default_rng(1), irregular()
     inner = np.setdiff1d(np.arange(len(mesh.points)), mesh.boundary)
     assert len(inner) == 20
     for _ in range(5):
@@ -65,11 +46,9 @@ def test_patch(name, dtype, device):
         x = mesh.points[:, [0, 2]] @ G.T + b
         assert np.allclose(gradients(mesh, x), G, rtol=0.0, atol=1e3 * eps("float64"))
         term, mu, lam = membrane(name, 0.3)
-        found = [
-            energy_and_forces(wc.Scene(mesh, density=1.0, terms=[term], positions=places), dtype, device)
-            for places in (x, x @ rotation.T)
-        ]
-        (energy, force), (energy_turned, force_turned) = found
+        model = wc.Scene(mesh, density=1.0, terms=[term]).build(device=device, dtype=dtype)
+        found = [[each.astype(np.float64) for each in energy_and_gradient(model, at)] for at in (x, x @ rotation.T)]
+        ((energy,), force), ((energy_turned,), force_turned) = found
         expected = DENSITIES[name](*np.linalg.svd(G, compute_uv=False), mu, lam) * mesh.triangle_areas.sum()
         # F is rounded by eps|x| over the shortest height, 0.1 m, and forces of STIFFNESS·|F|³·0.2 m a side with it.
         size = np.abs(x).max()
@@ -83,9 +62,7 @@ PULLED = [(name, ratio) for name in DENSITIES if name != "CorotatedMembrane" for
 PULLED.append(("CorotatedMembrane", 0.0))  # which has no other
 
 
-@pytest.mark.parametrize(
-    ("name", "ratio"), slow_but([each for each in PULLED if each[1] == 0.3 or each[0] == "CorotatedMembrane"], PULLED)
-)
+@table("name, ratio", [each for each in PULLED if each[1] == 0.3 or each[0] == "CorotatedMembrane"], PULLED)
 def test_tension_gives_back_the_moduli(name, ratio, device):
     """An irregular strip that is pulled at both ends by f a width: stretches f/Et and −νf/Et, up to the strain itself."""
     length, width = 2.0, 1.0
@@ -93,20 +70,16 @@ def test_tension_gives_back_the_moduli(name, ratio, device):
     ends = mesh.select("x < 0.001 or x > 1.999")
     # Ends of rows take half. Far targets pull with the same force wherever a vertex goes.
     share = np.where(np.isin(mesh.points[ends, 2], (0.0, width)), 0.5, 1.0) * width / 4
-    outwards = np.sign(mesh.points[ends, :1] - 1.0) * [1.0, 0.0, 0.0]
-    errors = []
+    outwards, errors = np.sign(mesh.points[ends, :1] - 1.0) * [1.0, 0.0, 0.0], []
     for strain in (1e-3, 1e-4):
-        far = 1e4
-        pull = wc.Attachment(
-            vertices=ends, stiffness=strain * STIFFNESS * share / far, targets=mesh.points[ends] + far * outwards
-        )
+        far = {"stiffness": strain * STIFFNESS * share / 1e4, "targets": mesh.points[ends] + 1e4 * outwards}
+        pull = wc.Attachment(vertices=ends, **far)
         scene = wc.Scene(mesh, density=0.1, terms=[membrane(name, ratio)[0], pull], gravity=WEIGHTLESS)
         rest = wc.equilibrium(scene, device=device)
         assert rest.status.result in SETTLED, rest.status
         F = gradients(mesh, rest.points)
         along, across = F[:, 0, 0] - 1.0, F[:, 2, 1] - 1.0
         errors.append(max(np.abs(along / strain - 1.0).max(), np.abs(across / strain + ratio).max()))
-    print(f"{name} ν={ratio:g}: errors {errors}")
     # St. Venant–Kirchhoff: f = Et(e + 3/2 e²); the others are less curved. The targets are 1e-4 strains away from infinity.
     assert errors[0] <= 2.0 * 1e-3 and errors[1] <= 2.0 * 1e-4
 
@@ -120,14 +93,9 @@ def test_a_strip_hanging_in_its_plane_is_of_second_order(name, device):
     errors = []
     for cells in (4, 8, 16):
         mesh = wc.Mesh.grid(6 * cells + 1, cells + 1, size=(length, width), pattern="alternating")
-        scene = wc.Scene(
-            mesh,
-            density=density,
-            # Bending, which costs nothing in the plane, keeps what the clamp presses together from buckling.
-            terms=[membrane(name, ratio, stiffness)[0], wc.DihedralBending(stiffness=1e-6 * stiffness)],
-            pins="x < 0.001",
-            gravity=(9.81, 0.0, 0.0),
-        )
+        # Bending, which costs nothing in the plane, keeps what the clamp presses together from buckling.
+        terms = [membrane(name, ratio, stiffness)[0], wc.DihedralBending(stiffness=1e-6 * stiffness)]
+        scene = wc.Scene(mesh, density=density, terms=terms, pins="x < 0.001", gravity=(9.81, 0.0, 0.0))
         rest = wc.equilibrium(scene, device=device)
         assert rest.status.result in SETTLED, rest.status
         move = (rest.points - mesh.points)[:, [0, 2]].reshape(cells + 1, -1, 2)  # rows along x
@@ -136,7 +104,6 @@ def test_a_strip_hanging_in_its_plane_is_of_second_order(name, device):
         narrower = (move[0, at, 1] - move[-1, at, 1]) / (weight * 3.0 * width)
         errors.append((abs(longer - 1.0), abs(narrower - ratio)))
     orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    print(f"{name}: errors {errors}, orders {orders.tolist()}")
     assert orders[:, 0].min() > 1.7 and errors[-1][0] < 2.5e-5
     # Second order too, down to what the strain, 1e-6, leaves.
     assert max(error for _, error in errors) < 1e-5 and errors[-1][1] < 3e-6
@@ -152,61 +119,46 @@ COLLAPSED = {
 FROM = [(start, 0.3) for start in COLLAPSED]
 
 
-@pytest.mark.parametrize(
-    ("start", "ratio"),
-    slow_but(FROM, [*FROM, ("in one direction", 0.0), ("at random places", 0.0), ("in both directions", 0.49)]),
-)
-def test_neo_hookean_recovers(start, ratio, device):
-    """From a hundredth of its size, with noise of 1e-3 of an edge, it unfolds to stretches of 1, however its start rounds."""
-    mesh = wc.Mesh.grid(9, 9, pattern="alternating")
+def collapsed(start, ratio, **fields):
+    """A membrane in a hundredth of its size, with noise of 1e-3 of an edge."""
+    mesh, terms = wc.Mesh.grid(9, 9, pattern="alternating"), [wc.NeoHookeanMembrane(stiffness=100.0, poisson_ratio=ratio)]
     noise = 1e-3 * np.median(mesh.edge_lengths) * np.random.default_rng(0).normal(size=mesh.points.shape)
-    positions = COLLAPSED[start](mesh, noise)
+    given = {"positions": COLLAPSED[start](mesh, noise), "gravity": WEIGHTLESS, **fields}
+    return wc.Scene(mesh, density=0.1, terms=terms, **given)
+
+
+@table("start, ratio", FROM, [*FROM, ("in one direction", 0.0), ("at random places", 0.0), ("in both directions", 0.49)])
+def test_neo_hookean_recovers(start, ratio, device):
+    """It unfolds to stretches of 1, however its start rounds."""
+    declared = collapsed(start, ratio)
+    mesh, positions = declared.mesh, declared.positions
     up = np.random.default_rng(1).random((3, *positions.shape)) < 0.5
     for rounded in (positions, *np.nextafter(positions, np.where(up, np.inf, -np.inf))):
-        scene = wc.Scene(
-            mesh,
-            density=0.1,
-            terms=[wc.NeoHookeanMembrane(stiffness=100.0, poisson_ratio=ratio)],
-            positions=rounded,
-            gravity=WEIGHTLESS,
-        )
+        scene = replace(declared, positions=rounded)
         assert np.abs(stretches(mesh, scene.positions) - 1.0).max() > 0.9
         # The tolerance is relative to the forces at the start, those of strains above 10 where vertices are at random places.
         rest = wc.equilibrium(scene, tolerance=1e-9, device=device)
         assert rest.status.result in SETTLED, rest.status
-        error = np.abs(stretches(mesh, rest.points) - 1.0).max()
-        print(f"{start}, ν={ratio:g}: {rest.iterations} iterations, stretches off by {error:.1e}")
         # Without bending stiffness it ends crumpled, where a stretch differs from 1 by the square of a move.
-        assert error < 1e-4
+        assert np.abs(stretches(mesh, rest.points) - 1.0).max() < 1e-4
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", COLLAPSED)
 def test_neo_hookean_recovers_in_float32(start, device):
     """Moves that cost nothing, which rounding makes without end, do not use up the iterations of a sheet that is at rest."""
-    mesh = wc.Mesh.grid(9, 9, pattern="alternating")
-    noise = 1e-3 * np.median(mesh.edge_lengths) * np.random.default_rng(0).normal(size=mesh.points.shape)
-    membrane = wc.NeoHookeanMembrane(stiffness=100.0, poisson_ratio=0.49)
-    scene = wc.Scene(mesh, density=0.1, terms=[membrane], positions=COLLAPSED[start](mesh, noise), gravity=WEIGHTLESS)
+    scene = collapsed(start, 0.49)
     rest = wc.equilibrium(scene, dtype="float32", device=device)
     assert rest.status.result in SETTLED and rest.iterations < 500, rest
-    assert np.abs(stretches(mesh, rest.points) - 1.0).max() < 1e-4
+    assert np.abs(stretches(scene.mesh, rest.points) - 1.0).max() < 1e-4
 
 
 def test_neo_hookean_recovers_in_motion(device):
     """Implicit steps of 1/60 s unfold a random heap, and damp it to rest."""
-    mesh = wc.Mesh.grid(9, 9, pattern="alternating")
-    scene = wc.Scene(
-        mesh,
-        density=0.1,
-        terms=[wc.NeoHookeanMembrane(stiffness=100.0, poisson_ratio=0.3)],
-        positions=COLLAPSED["at random places"](mesh, 0.0),
-        gravity=WEIGHTLESS,
-        duration=1.0,
-    )
+    scene = collapsed("at random places", 0.3, duration=1.0)
     animation = wc.simulate(scene, wc.Newton(dt=1 / 60), device=device, dtype="float64")
     assert animation.status.ok, animation.status
-    errors = [np.abs(stretches(mesh, points) - 1.0).max() for points in animation.points]
+    errors = [np.abs(stretches(scene.mesh, points) - 1.0).max() for points in animation.points]
     assert errors[0] > 1.0 and errors[10] < 0.1 and errors[60] < 0.01
 
 
@@ -234,24 +186,22 @@ def flung(sheet, limit, seed=0, **scene):
     return wc.Scene(mesh, density=0.1, terms=[limit], velocities=velocities, gravity=WEIGHTLESS, **scene)
 
 
-@pytest.mark.parametrize("sheet", slow_but(list(SHEETS)[:1], SHEETS))
+@table("sheet", list(SHEETS)[:1], SHEETS)
 @pytest.mark.parametrize("limits", [BOTH, MOST, LEAST, NO_STRETCH], ids=str)
 @pytest.mark.parametrize("kind", [wc.SpringLimit, wc.StrainLimit])
 def test_converged_pbd_keeps_limits(kind, limits, sheet, device):
     limit = kind(**limits)
     scene = flung(sheet, limit, fps=60.0)
-    stepper = wc.PBD(substeps=1, iterations=1000).bind(scene.build(device=device, dtype="float64"))
-    free = scene.mesh.points + stepper.h * scene.velocities
+    x, stepper = after_steps(scene, wc.PBD(substeps=1, iterations=1000), device)
     least, most = limits.get("least", 0.0), limits.get("most", np.inf)
 
     def beyond(x):
         values = measured(limit, scene.mesh, x)
         return max((least - values).max(), (values - most).max())
 
-    stepper.step()
-    assert beyond(free) > 0.03, "without the limit it would be passed"
+    assert beyond(scene.mesh.points + stepper.h * scene.velocities) > 0.03, "without the limit it would be passed"
     # What is left falls linearly with the sweeps, unless least and most meet in one place and it buckles.
-    assert beyond(stepper.state.x.numpy()) < (2e-3 if limits is BOTH else 1e-5)
+    assert beyond(x) < (2e-3 if limits is BOTH else 1e-5)
 
 
 # The local step moves F straight to its nearest point, which is the nearest in the metric of the masses too where G W Gᵀ is a
@@ -262,16 +212,10 @@ gains = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize(
-    ("kind", "sheet"),
-    [
-        (wc.SpringLimit, "equilateral"),
-        (wc.SpringLimit, "alternating"),
-        (wc.SpringLimit, "irregular"),
-        (wc.StrainLimit, "equilateral"),
-        pytest.param(wc.StrainLimit, "irregular", marks=gains),
-    ],
-)
+KEPT = [*((wc.SpringLimit, sheet) for sheet in SHEETS), (wc.StrainLimit, "equilateral")]
+
+
+@pytest.mark.parametrize(("kind", "sheet"), [*KEPT, pytest.param(wc.StrainLimit, "irregular", marks=gains)])
 @pytest.mark.parametrize("limits", [MOST, NO_STRETCH], ids=str)
 def test_limits_of_stretch_alone_add_no_energy(kind, sheet, limits, device):
     """From a feasible state σ_max alone never raises the kinetic energy; sums with ω below 1/valence are projections."""
@@ -287,27 +231,16 @@ def test_limits_of_stretch_alone_add_no_energy(kind, sheet, limits, device):
     for _ in range(30):
         stepper.step()
         energies.append(kinetic())
-    ratios = np.array(energies[1:]) / energies[:-1]
-    print(
-        f"{kind.__name__}, {sheet}, {limits}: a step multiplies the kinetic energy by {ratios.min():.4f} to {ratios.max():.4f}"
-    )
-    assert ratios.max() <= 1.0
+    assert (np.diff(energies) <= 0.0).all()
 
 
-NEWTON, EXPLICIT = wc.Newton(substeps=4), wc.Explicit(substeps=44)
+SERVED = [(kind, wc.Newton(substeps=4)) for kind in (wc.SpringLimit, wc.StrainLimit)]
 
 
-@pytest.mark.parametrize(
-    ("kind", "solver"),
-    slow_but(
-        [(wc.SpringLimit, NEWTON), (wc.StrainLimit, NEWTON)],
-        [(wc.SpringLimit, NEWTON), (wc.StrainLimit, NEWTON), (wc.SpringLimit, EXPLICIT)],
-    ),
-)
+@table("kind, solver", SERVED, [*SERVED, (wc.SpringLimit, wc.Explicit(substeps=44))])
 def test_finite_limits_serve_solvers_that_need_forces(kind, solver, device):
     """A soft membrane that hangs by two corners stretches no further than its limit's own stiffness lets it."""
-    mesh = wc.Mesh.grid(9, 9, pattern="alternating")
-    worst = []
+    mesh, worst = wc.Mesh.grid(9, 9, pattern="alternating"), []
     for limits in ([], [kind(most=1.05, stiffness=2e3)]):
         terms = [wc.NeoHookeanMembrane(stiffness=5.0, poisson_ratio=0.3), *limits]
         scene = wc.Scene(mesh, density=0.1, terms=terms, pins="corners and z == 0", duration=0.4)
@@ -329,19 +262,6 @@ def test_explicit_steps_count_limits_as_reached(limit, material, device):
     models = (flung("irregular", term).build(device=device, dtype="float64", copies=2) for term in (limit, material))
     of_limit, of_material = (step_limits(model) for model in models)
     assert of_limit == pytest.approx(of_material, rel=1e-6) and 0.0 < of_limit[0] < 1.0
-
-
-@pytest.mark.parametrize("solver", [wc.Newton(substeps=1), wc.Explicit(substeps=1)])
-@pytest.mark.parametrize("kind", [wc.SpringLimit, wc.StrainLimit])
-def test_hard_limits_are_refused_where_forces_are_needed(kind, solver, device):
-    with pytest.raises(ValueError, match=f"cannot take {kind.__name__} with infinite stiffness; PBD"):
-        solver.bind(flung("alternating", kind(most=1.1)).build(device=device))
-
-
-@pytest.mark.parametrize("solver", [wc.PBD(substeps=1), wc.XPBD(substeps=1)])
-def test_infinite_stiffness_is_refused_where_no_projection_is(solver, device):
-    with pytest.raises(ValueError, match="cannot take StVKMembrane with infinite stiffness, as its"):
-        solver.bind(flung("alternating", wc.StVKMembrane(stiffness=np.inf)).build(device=device))
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
@@ -369,11 +289,8 @@ def test_moduli_of_a_material(cls):
 
 def test_a_stiffness_varies_and_the_ratio_stays(device):
     mesh = irregular()
-    x = mesh.points * [1.2, 1.0, 0.9]
-    stiffness = [10.0, 20.0, 70.0]
+    x, stiffness = mesh.points * [1.2, 1.0, 0.9], [10.0, 20.0, 70.0]
     scene = wc.Scene(mesh, density=0.1, terms=[wc.StVKMembrane(stiffness=1.0, poisson_ratio=0.4)], positions=x)
     model = scene.build(device=device, dtype="float64", copies=3, vary={"StVKMembrane.stiffness": stiffness})
-    energy = wp.zeros(3, dtype=wp.float64, device=model.device)
-    Energy(model, Sums(model)).add(model.positions, energy)
-    assert np.allclose(energy.numpy(), energy.numpy()[0] / 10.0 * np.array(stiffness), rtol=FEW * eps("float64"))
-    assert energy.numpy()[0] > 0.0
+    energy, _ = energy_and_gradient(model)
+    assert np.allclose(energy, energy[0] / 10.0 * np.array(stiffness), rtol=FEW * eps("float64")) and energy[0] > 0.0

@@ -5,7 +5,8 @@ import pytest
 
 import warpcloth as wc
 from support.energies import FEW, energy_and_gradient, eps
-from support.steps import after_one_step, newton_step
+from support.meshes import irregular
+from support.steps import after_steps, newton_step
 
 E1, E2, G, RATIO = 1000.0, 2500.0, 150.0, 0.25  # N/m
 MODULI = {"warp": E1, "weft": E2, "shear": G, "poisson_ratio": RATIO}
@@ -13,12 +14,9 @@ MODULI = {"warp": E1, "weft": E2, "shear": G, "poisson_ratio": RATIO}
 COMPLIANCE = np.array([[1.0 / E1, -RATIO / E1, 0.0], [-RATIO / E1, 1.0 / E2, 0.0], [0.0, 0.0, 1.0 / G]])
 
 
-def jittered(n):
-    """A flat irregular sheet of 1 m in the plane y = 0; its outline stays a square."""
-    grid = wc.Mesh.grid(n, n, pattern="alternating")
-    shift = np.random.default_rng(0).uniform(-0.25, 0.25, (n * n, 3)) / (n - 1) * [1.0, 0.0, 1.0]
-    shift[grid.boundary] = 0.0
-    return wc.Mesh(grid.points + shift, grid.triangles)
+def energy_and_force(mesh, term, x, device):
+    """At positions x, of a scene of the term alone."""
+    return energy_and_gradient(wc.Scene(mesh, density=1.0, terms=[term]).build(device=device, dtype="float64"), x)
 
 
 def stretches(mesh, x):
@@ -30,13 +28,9 @@ def stretches(mesh, x):
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 20.0, 30.0, 45.0, 60.0, 70.0, 80.0, 90.0])
 def test_an_off_axis_strip_has_the_modulus_of_its_angle(degrees, device):
     """1/E(θ) = c⁴/E₁ + s⁴/E₂ + (1/G − 2ν₁₂/E₁)s²c². A line load f stretches it by λ, ½λ(λ² − 1)E(θ) = f; it shears too."""
-    mesh, theta = jittered(5), np.radians(degrees)
-    pull = 0.1 * E1
-    ends = [np.abs(mesh.points[:, 0] - at) < 1e-9 for at in (0.0, 1.0)]
-    loads = [
-        wc.Traction(vertices=np.flatnonzero(end), traction=(way * pull, 0.0, 0.0))
-        for end, way in zip(ends, (-1, 1), strict=True)
-    ]
+    mesh, theta, pull = irregular(5, 5), np.radians(degrees), 0.1 * E1
+    ends = [np.flatnonzero(np.abs(mesh.points[:, 0] - at) < 1e-9) for at in (0.0, 1.0)]
+    loads = [wc.Traction(vertices=end, traction=(way * pull, 0.0, 0.0)) for end, way in zip(ends, (-1, 1), strict=True)]
     # The strip lies along x; its warp is turned clockwise from there.
     membrane = wc.OrthotropicMembrane.from_moduli(**MODULI, direction=(1.0, 0.0, 0.0), warp_angle=-theta)
     scene = wc.Scene(mesh, density=0.1, terms=[membrane], loads=loads, pins=[0], gravity=(0.0, 0.0, 0.0))
@@ -58,7 +52,7 @@ def test_an_off_axis_strip_has_the_modulus_of_its_angle(degrees, device):
 
 def test_a_picture_frame_measures_the_shear_modulus(device):
     """Sides a along warp and weft keep their lengths: the frame pulls by aG sin γ cos γ/sin(π/4 − γ/2) at its corners."""
-    mesh, gamma, a = jittered(6), 0.4, 1.0
+    mesh, gamma, a = irregular(6, 6), 0.4, 1.0
     membrane = wc.OrthotropicMembrane.from_moduli(**MODULI, direction=(1.0, 0.0, 0.0))
 
     def sheared(angle):
@@ -66,8 +60,7 @@ def test_a_picture_frame_measures_the_shear_modulus(device):
         frame = np.array([[np.cos(half), 0.0, np.sin(half)], [0.0, 0.0, 0.0], [np.sin(half), 0.0, np.cos(half)]])
         return mesh.points @ frame.T
 
-    model = wc.Scene(mesh, density=1.0, terms=[membrane]).build(device=device, dtype="float64")
-    energy, force = energy_and_gradient(model, sheared(gamma))
+    energy, force = energy_and_force(mesh, membrane, sheared(gamma), device)
     assert energy[0] == pytest.approx(0.5 * G * a**2 * np.sin(gamma) ** 2, rel=1e3 * eps("float64"))
     moves = (sheared(gamma + 1e-5) - sheared(gamma - 1e-5)) / 2e-5  # by the angle
     longer = -2.0 * a * 0.5 * np.sin(0.5 * gamma - np.pi / 4.0)  # of the diagonal 2a cos(π/4 − γ/2), by the angle
@@ -77,10 +70,9 @@ def test_a_picture_frame_measures_the_shear_modulus(device):
 
 def test_biaxial_tension_has_the_stress_of_both_moduli(device):
     """P = FS on each side of a sheet, shared by its vertices, to rounding."""
-    mesh, F = jittered(6), np.array([1.1, 0.97])
+    mesh, F = irregular(6, 6), np.array([1.1, 0.97])
     membrane = wc.OrthotropicMembrane.from_moduli(**MODULI, direction=(1.0, 0.0, 0.0))
-    model = wc.Scene(mesh, density=1.0, terms=[membrane]).build(device=device, dtype="float64")
-    _, force = energy_and_gradient(model, mesh.points * [F[0], 1.0, F[1]])
+    _, force = energy_and_force(mesh, membrane, mesh.points * [F[0], 1.0, F[1]], device)
     S = np.linalg.inv(COMPLIANCE)[:2, :2] @ (0.5 * (F**2 - 1.0))
     for axis, at in ((0, 0), (2, 1)):
         side = np.abs(mesh.points[:, axis] - 1.0) < 1e-9
@@ -88,17 +80,13 @@ def test_biaxial_tension_has_the_stress_of_both_moduli(device):
 
 
 def test_equal_moduli_are_an_isotropic_membrane(device):
-    mesh = jittered(6)
+    mesh = irregular(6, 6)
     x = mesh.points + np.random.default_rng(2).normal(scale=0.05, size=mesh.points.shape)
-    of = [
-        energy_and_gradient(wc.Scene(mesh, density=1.0, terms=[term]).build(device=device, dtype="float64"), x)
-        for term in (
-            wc.OrthotropicMembrane(stiffness=30.0, poisson_ratio=0.3, warp=(1.0, 0.0, 0.4)),
-            wc.StVKMembrane(stiffness=30.0, poisson_ratio=0.3),
-        )
-    ]
-    assert of[0][0] == pytest.approx(of[1][0], rel=1e3 * eps("float64"))
-    assert of[0][1] == pytest.approx(of[1][1], abs=1e3 * eps("float64") * np.abs(of[1][1]).max())
+    orthotropic = wc.OrthotropicMembrane(stiffness=30.0, poisson_ratio=0.3, warp=(1.0, 0.0, 0.4))
+    energy, force = energy_and_force(mesh, wc.StVKMembrane(stiffness=30.0, poisson_ratio=0.3), x, device)
+    found = energy_and_force(mesh, orthotropic, x, device)
+    assert found[0] == pytest.approx(energy, rel=1e3 * eps("float64"))
+    assert found[1] == pytest.approx(force, abs=1e3 * eps("float64") * np.abs(force).max())
 
 
 def test_directions_by_texture_vector_and_angle_agree(device):
@@ -114,14 +102,8 @@ def test_directions_by_texture_vector_and_angle_agree(device):
         {"warp_angle": np.full(len(mesh.triangles), np.pi)},
     ):
         for kind, more in ((wc.OrthotropicMembrane, {"shear_ratio": 0.1}), (wc.PlateBending, {"twist_ratio": 0.1})):
-            energies = [
-                energy_and_gradient(wc.Scene(mesh, density=1.0, terms=[term]).build(device=device, dtype="float64"), x)[0][0]
-                for term in (
-                    kind(stiffness=1.0, weft_ratio=3.0, **more),
-                    kind(stiffness=1.0, weft_ratio=3.0, **more, **given),
-                    kind(stiffness=1.0, weft_ratio=3.0, **more, warp_angle=0.5),
-                )
-            ]
+            terms = [kind(stiffness=1.0, weft_ratio=3.0, **more, **each) for each in ({}, given, {"warp_angle": 0.5})]
+            energies = [energy_and_force(mesh, term, x, device)[0][0] for term in terms]
             assert energies[1] == pytest.approx(energies[0], rel=1e4 * FEW * eps("float64"))
             assert abs(energies[2] / energies[0] - 1.0) > 1e-3
 
@@ -135,13 +117,12 @@ def test_solvers_that_minimise_meet(solver, device):
     membrane = wc.OrthotropicMembrane.from_moduli(warp=50.0, weft=120.0, shear=10.0, poisson_ratio=0.3)
     scene = wc.Scene(mesh, density=0.1, terms=[membrane], positions=start, pins=[0])
     exact = newton_step(scene, device)
-    assert np.abs(after_one_step(scene, solver, device)[0] - exact).max() < 1e-8
+    assert np.abs(after_steps(scene, solver, device)[0] - exact).max() < 1e-8
 
 
 def test_stress_of_an_animation_is_that_of_its_directions(device):
     """S = Cε, of a strain along the warp of an orthotropic membrane."""
-    mesh = wc.Mesh.grid(4, 4)
-    membrane = wc.OrthotropicMembrane.from_moduli(**MODULI)
+    mesh, membrane = wc.Mesh.grid(4, 4), wc.OrthotropicMembrane.from_moduli(**MODULI)
     found = wc.analyze([mesh.points, mesh.points * [1.01, 1.0, 1.0]], mesh=mesh, material=membrane, measures=["energy_density"])
     strain = 0.5 * (1.01**2 - 1.0)
     expected = 0.5 * E1 / (1.0 - RATIO**2 * E2 / E1) * strain**2

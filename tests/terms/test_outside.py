@@ -9,8 +9,8 @@ import pytest
 import warpcloth as wc
 from support.command_line import refused, run
 from support.outside import FILES, Plane
-from support.rows import slow_but
-from support.steps import after_one_step, newton_step
+from support.rows import table
+from support.steps import after_steps, newton_step
 from warpcloth import terms
 from warpcloth.base import extensions
 from warpcloth.solvers import SOLVERS
@@ -63,10 +63,10 @@ ITERATED = {
 }
 
 
-@pytest.mark.parametrize("name", slow_but(list(ITERATED)[:1], ITERATED))
+@table("name", list(ITERATED)[:1], ITERATED)
 def test_solvers_that_minimise_meet(name, device):
     solver = SOLVERS[name](substeps=1, **ITERATED[name])
-    x, _ = after_one_step(sheet(), solver, device)
+    x, _ = after_steps(sheet(), solver, device)
     assert np.abs(x - newton_step(sheet(), device)).max() < 1e-8
 
 
@@ -114,8 +114,7 @@ def test_a_scene_file_runs_on_the_command_line(tmp_path, capfd):
     file = tmp_path / "slope.py"
     file.write_text(FILE, encoding="utf-8")
     assert run(capfd, "run", file, "--solver", "xpbd", "-o", tmp_path / "slope.usdc")[0] == 0
-    assert "Plane" in run(capfd, "info", file)[1]
-    assert len(wc.open_sequence(tmp_path / "slope.usdc").labels) == 7
+    assert "Plane" in run(capfd, "info", file)[1] and len(wc.open_sequence(tmp_path / "slope.usdc").labels) == 7
     del terms.TERMS["Plane"]
 
 

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.sparse.linalg import spsolve
-from scipy.spatial import Delaunay
 
 import warpcloth as wc
 from support.continuum import hill, turn
 from support.continuum import jittered as irregular
 from support.energies import energy_and_gradient, every_dtype
 from support.energies import eps as eps_of
-from support.steps import after_one_step
+from support.meshes import delaunay, rolled
+from support.steps import after_steps, newton_step
 from warpcloth.core.hessian import Hessian
 from warpcloth.lab import elastica
 from warpcloth.mesh.curvature import curvature_operator
@@ -22,20 +22,9 @@ from warpcloth.mesh.curvature import curvature_operator
 EPS = eps_of("float64")
 
 
-def _triangulated(points):
-    """A flat mesh of points (n, 2) in x and z, without the slivers on the outline."""
-    triangles = Delaunay(points).simplices
-    sides = points[triangles[:, 1:]] - points[triangles[:, :1]]
-    areas = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
-    triangles = triangles[areas > 1e-3 * np.median(areas)]
-    return wc.Mesh(np.stack([points[:, 0], np.zeros(len(points)), points[:, 1]], axis=1), triangles)
-
-
 def _scattered(n, stretch=0.0):
-    """Vertices of a grid moved by up to a quarter of their distances, but for the outline and the middle.
-
-    With ``stretch`` s the distances at the outline are (1 + s)/(1 − s) times those in the middle.
-    """
+    """Vertices of a grid moved by up to a quarter of their distances, but for the outline and the middle."""
+    # With ``stretch`` s the distances at the outline are (1 + s)/(1 − s) times those in the middle.
     line = np.linspace(0.0, 1.0, n)
     line = line + stretch * np.sin(2.0 * np.pi * line) / (2.0 * np.pi)
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
@@ -43,19 +32,18 @@ def _scattered(n, stretch=0.0):
     moved = ((points > 0.0) & (points < 1.0)).all(axis=1)
     moved[len(points) // 2] = False
     random = np.random.default_rng(1)
-    return _triangulated(points + np.where(moved[:, None], random.uniform(-0.25, 0.25, points.shape) * spacing, 0.0))
+    return delaunay(points + np.where(moved[:, None], random.uniform(-0.25, 0.25, points.shape) * spacing, 0.0))
 
 
 def _equilateral(n):
     """A square with rows of nearly equilateral triangles, a vertex in its middle."""
-    rows = 2 * round((n - 1) / np.sqrt(0.75) / 2.0)
-    points = []
+    rows, points = 2 * round((n - 1) / np.sqrt(0.75) / 2.0), []
     for row in range(rows + 1):
         line = np.linspace(0.0, 1.0, n)
         if (row - rows // 2) % 2:
             line = np.concatenate([[0.0], (line[1:] + line[:-1]) / 2.0, [1.0]])
         points.append(np.stack([line, np.full(len(line), row / rows)], axis=1))
-    return _triangulated(np.concatenate(points))
+    return delaunay(np.concatenate(points))
 
 
 MESHES = {
@@ -75,16 +63,10 @@ MATERIALS = {
     "orthotropic": (wc.PlateBending.from_stiffnesses(**ORTHOTROPIC, direction=(1.0, 0.0, 0.0)), tuple(ORTHOTROPIC.values())),
 }
 each_material = pytest.mark.parametrize("material", MATERIALS)
-CURVATURES = {
-    "cylinder": (1.0, 0.0, 0.0),
-    **{
-        f"cylinder at {a}°": (np.cos(np.radians(a)) ** 2, np.sin(np.radians(a)) ** 2, 0.5 * np.sin(np.radians(2 * a)))
-        for a in (30, 45, 135)
-    },
-    "twist": (0.0, 0.0, 1.0),
-    "saddle": (1.0, -1.0, 0.0),
-    "dome": (1.0, 1.0, 0.0),
-}
+TURNS = np.radians([0.0, 30.0, 45.0, 135.0])
+# Of cylinders along some directions, a twist, a saddle and a dome.
+CURVATURES = [*np.stack([np.cos(TURNS) ** 2, np.sin(TURNS) ** 2, 0.5 * np.sin(2.0 * TURNS)], axis=1)]
+CURVATURES += [(0.0, 0.0, 1.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0)]
 
 
 def model_of(mesh, bending, device, dtype="float64", **given):
@@ -94,16 +76,14 @@ def model_of(mesh, bending, device, dtype="float64", **given):
 @each_material
 @each_mesh
 def test_a_surface_of_constant_curvature_costs_what_a_plate_does(pattern, material, device):
-    """½κᵀCκ per area, whatever the mesh, boundary included: to rounding, as second derivatives of a quadratic are exact.
-
-    An entry of y sums up positions over squares of lengths; the shortest altitude a has κ rounded by some ε/a².
-    """
+    """½κᵀCκ per area, whatever the mesh, boundary included: to rounding, as second derivatives of a quadratic are exact."""
+    # An entry of y sums up positions over squares of lengths; the shortest altitude a has κ rounded by some ε/a².
     mesh, (bending, (D1, D2, D12, D66)) = mesh_of(pattern, 11), MATERIALS[material]
     model, (x, _, z) = model_of(mesh, bending, device), mesh.points.T
-    for name, (kx, kz, kxz) in CURVATURES.items():
+    for kx, kz, kxz in CURVATURES:
         lifted = mesh.points + np.outer(0.5 * kx * x**2 + 0.5 * kz * z**2 + kxz * x * z, [0.0, 1.0, 0.0])
         expected = 0.5 * (D1 * kx**2 + D2 * kz**2 + 2.0 * D12 * kx * kz + 4.0 * D66 * kxz**2)
-        assert energy_and_gradient(model, lifted)[0][0] == pytest.approx(expected, rel=1e-8), name
+        assert energy_and_gradient(model, lifted)[0][0] == pytest.approx(expected, rel=1e-8), (kx, kz, kxz)
 
 
 @pytest.mark.parametrize("degrees", [0, 25, 45, 90])
@@ -111,11 +91,8 @@ def test_a_surface_of_constant_curvature_costs_what_a_plate_does(pattern, materi
 def test_a_sheet_rolled_up_without_stretch_is_a_cylinder(pattern, degrees, device):
     """Chords differ from arcs: a second derivative over a patch of size s, two edges, is off by (s/R)²/12."""
     mesh, radius = mesh_of(pattern, 21), 2.0
-    along = np.array([np.cos(np.radians(degrees)), 0.0, np.sin(np.radians(degrees))])
-    arc, across = mesh.points @ along, np.cross(along, [0.0, 1.0, 0.0])
-    rolled = np.outer(radius * np.sin(arc / radius), along) + np.outer(mesh.points @ across, across)
-    rolled += np.outer(radius * (1.0 - np.cos(arc / radius)), [0.0, 1.0, 0.0])
-    energy = energy_and_gradient(model_of(mesh, MATERIALS["0.3"][0], device), rolled)[0][0]
+    model = model_of(mesh, MATERIALS["0.3"][0], device)
+    energy = energy_and_gradient(model, rolled(mesh.points, radius, degrees))[0][0]
     assert energy == pytest.approx(0.5 * D / radius**2, rel=2.0 * (2.0 * mesh.edge_lengths.max() / radius) ** 2 / 12.0)
     assert energy == pytest.approx(0.5 * D / radius**2, rel=1.5e-3)
 
@@ -129,8 +106,7 @@ def stiffness_matrix(mesh, bending, device):
 
 
 def deflection(matrix, forces, pins):
-    free = np.setdiff1d(np.arange(len(forces)), pins)
-    found = np.zeros(len(forces))
+    free, found = np.setdiff1d(np.arange(len(forces)), pins), np.zeros(len(forces))
     found[free] = spsolve(matrix[free][:, free].tocsc(), forces[free])
     return found
 
@@ -211,9 +187,7 @@ def test_only_lengths_of_the_rest_shape_count():
     folded = flat.points.copy()
     beyond = folded[:, 0] > 0.5
     folded[beyond] = np.stack([np.full(beyond.sum(), 0.5), folded[beyond, 0] - 0.5, folded[beyond, 2]], axis=1)
-    one, other = (
-        wc.PlateBending(stiffness=D, poisson_ratio=0.3).operator(wc.Mesh(p, flat.triangles)) for p in (flat.points, folded)
-    )
+    one, other = (MATERIALS["0.3"][0].operator(wc.Mesh(points, flat.triangles)) for points in (flat.points, folded))
     assert abs(one - other).max() < 1e3 * EPS * abs(one).max()
 
 
@@ -240,10 +214,8 @@ STRIPS = {
     ("strip", "pattern"), [("warp", "diagonal"), ("weft", "alternating"), ("45°", "diagonal"), ("45°", "alternating")]
 )
 def test_a_strip_over_a_bar_is_the_elastica(strip, pattern, device):
-    """Both ends of a strip hang over a bar, where it is level by symmetry: H/W of the elastica to 0.2 %.
-
-    The membrane, kL²/D = 1e6, takes 1e-5 of that.
-    """
+    """Both ends of a strip hang over a bar, where it is level by symmetry: H/W of the elastica to 0.2 %."""
+    # The membrane, kL²/D = 1e6, takes 1e-5 of that.
     material, ratio = STRIPS[strip]
     given = wc.Mesh.grid(2 * ELEMENTS + 1, 5, size=(2.0, 4.0 / ELEMENTS), pattern=pattern)
     mesh = wc.Mesh(given.points - [1.0, 0.0, 0.0], given.triangles)
@@ -258,14 +230,11 @@ def test_a_strip_over_a_bar_is_the_elastica(strip, pattern, device):
 
 @pytest.mark.slow
 def test_drapes_of_all_patterns_come_together(device):
-    """A sheet of 0.3 m hangs from its corners, which are moved together by 15 %: each mesh continues the one of half its size.
-
-    The root of the mean square distance between any two falls from 4.3 to 0.71 and 0.13 mm. With hinges it stays at 0.88 mm.
-    """
+    """A sheet of 0.3 m hangs from corners that are moved together by 15 %: each mesh continues the one of half its size."""
+    # The root of the mean square distance between any two falls from 4.3 to 0.71 and 0.13 mm. With hinges it stays at 0.88 mm.
     size, patterns = 0.3, ("diagonal", "alternating", "equilateral", "jittered")
     line = np.linspace(1e-6, size - 1e-6, 9)
-    at = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    apart = {}
+    at, apart = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2), {}
     for bending in (wc.PlateBending(stiffness=1e-4, poisson_ratio=0.3), wc.DihedralBending(stiffness=1e-4)):
         shapes = {}
         for n in (9, 17, 33):
@@ -289,21 +258,17 @@ def test_drapes_of_all_patterns_come_together(device):
             found = np.array([shapes[pattern](at) for pattern in patterns])
             pairs = np.linalg.norm(found[:, None] - found, axis=-1)
             apart[bending.label, n] = float(np.sqrt((pairs**2).mean(axis=-1)).max())
-    print(apart)
     plates, hinges = ([apart[label, n] for n in (17, 33)] for label in ("PlateBending", "DihedralBending"))
-    assert plates[1] < 2e-4 and plates[0] / plates[1] > 3.0
-    assert hinges[1] > 4.0 * plates[1]
+    assert plates[1] < 2e-4 and plates[0] / plates[1] > 3.0 and hinges[1] > 4.0 * plates[1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("over", [0.95, 1.2])
 def test_wrinkles_of_a_stretched_sheet(over, device):
-    """λ = 2√π (DL²/T)^¼ to 5 % (Cerda and Mahadevan 2003, *Geometry and physics of wrinkling*).
-
-    The sheet is stretched between hinged ends L apart, and its sides are brought together by ``over`` times what buckles it, a
-    stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k. A stress of 1.018 N also lets 5½ waves
-    buckle, which are stable too; so the shape of least energy of three starts counts.
-    """
+    """λ = 2√π (DL²/T)^¼ to 5 % (Cerda and Mahadevan 2003, *Geometry and physics of wrinkling*)."""
+    # The sheet is stretched between hinged ends L apart, and its sides are brought together by ``over`` times what buckles it,
+    # a stress of N = 2π√(DT)/L, the least of Dk² + T(π/L)²/k² over the wave number k. A stress of 1.018 N also lets 5½ waves
+    # buckle, which are stable too; so the shape of least energy of three starts counts.
     L, Y, stretch = 0.2, 100.0, 1.01
     T = 0.5 * Y * (stretch**2 - 1.0)
     known, width = 0.2 * L, L  # five waves
@@ -329,8 +294,7 @@ def test_wrinkles_of_a_stretched_sheet(over, device):
         return
     before = np.flatnonzero(middle[1:-2] * middle[2:-1] < 0.0) + 1
     nodes = (before + middle[before] / (middle[before] - middle[before + 1])) * width / 40
-    assert np.abs(middle).max() > 5e-5
-    assert 2.0 * np.diff(nodes).mean() == pytest.approx(known, rel=0.05)
+    assert np.abs(middle).max() > 5e-5 and 2.0 * np.diff(nodes).mean() == pytest.approx(known, rel=0.05)
 
 
 # --- solvers
@@ -358,32 +322,27 @@ MEET = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(
-            name, marks=() if name == "newton" else [pytest.mark.host] + [pytest.mark.slow] * (name != "xpbd sequential")
-        )
-        for name in MEET
-    ],
-)
+ELSEWHERE = {name: [pytest.mark.host] + [pytest.mark.slow] * (name != "xpbd sequential") for name in MEET if name != "newton"}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=ELSEWHERE.get(name, ())) for name in MEET])
 def test_all_meet(name, device):
     """1e-8 m from Newton in float64, 1e-4 m in float32 with one sweep and one matrix; without the plate it is elsewhere."""
     solver, declared = MEET[name], swinging()
     newton = wc.Newton(substeps=1, tolerance=1e-12, linear="factorised", integrator=solver.integrator)
-    exact, _ = after_one_step(declared, newton, device)
-    assert np.abs(after_one_step(declared, solver, device)[0] - exact).max() < 1e-8
+    exact, _ = after_steps(declared, newton, device)
+    assert np.abs(after_steps(declared, solver, device)[0] - exact).max() < 1e-8
     if "factorised" not in name and "coloured" not in name:  # whose kernels other rows have in float32
-        assert np.abs(after_one_step(declared, solver, device, "float32")[0] - exact).max() < 1e-4
-    assert np.abs(after_one_step(replace(declared, terms=declared.terms[:1]), newton, device)[0] - exact).max() > 1e-4
+        assert np.abs(after_steps(declared, solver, device, "float32")[0] - exact).max() < 1e-4
+    assert np.abs(after_steps(replace(declared, terms=declared.terms[:1]), newton, device)[0] - exact).max() > 1e-4
 
 
 @pytest.mark.parametrize("solver", [wc.ProjectiveDynamics(substeps=1), wc.ADMM(substeps=1)], ids=["pd", "admm"])
 def test_a_plate_alone_takes_one_solve(solver, device):
     """All of U is in the constant matrix."""
     declared = replace(swinging(), terms=swinging().terms[1:])
-    exact, _ = after_one_step(declared, wc.Newton(substeps=1, tolerance=1e-12, linear="factorised"), device)
-    found, stepper = after_one_step(declared, replace(solver, tolerance=1e-9), device)
+    exact = newton_step(declared, device)
+    found, stepper = after_steps(declared, replace(solver, tolerance=1e-9), device)
     assert np.abs(found - exact).max() < 1e-10 and stepper.iterations <= 3
 
 
@@ -395,12 +354,10 @@ def test_a_run_ends_well_with_the_others(device):
 def test_copies_vary_in_what_the_weights_hold(device):
     declared, solver = swinging(), wc.ProjectiveDynamics(substeps=1, iterations=50)
     vary = {"PlateBending.poisson_ratio": [0.3, -0.4], "PlateBending.stiffness": [1e-3, 2e-3]}
-    both, _ = after_one_step(declared, solver, device, copies=2, vary=vary)
-    bending = replace(declared.terms[1], poisson_ratio=-0.4, stiffness=2e-3)
-    alone = [
-        after_one_step(replace(declared, terms=[declared.terms[0], each]), solver, device)[0]
-        for each in (declared.terms[1], bending)
-    ]
+    both, _ = after_steps(declared, solver, device, copies=2, vary=vary)
+    springs, bending = declared.terms
+    both_terms = bending, replace(bending, poisson_ratio=-0.4, stiffness=2e-3)
+    alone = [after_steps(replace(declared, terms=[springs, each]), solver, device)[0] for each in both_terms]
     assert np.abs(both - np.concatenate(alone)).max() < 1e-10 and np.abs(alone[1] - alone[0]).max() > 1e-5
 
 

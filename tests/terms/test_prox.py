@@ -12,7 +12,8 @@ import warp as wp
 
 import warpcloth as wc
 from support.energies import every_dtype
-from support.steps import after_one_step, newton_step
+from support.layers import positions
+from support.steps import after_frames, after_steps, newton_step
 from warpcloth.kernels import term as terms
 from warpcloth.kernels.terms.attachment import measure, weight
 from warpcloth.terms.declared import Declared, quantity
@@ -127,19 +128,17 @@ def test_solvers_that_take_it_end_where_newton_does(name, free_axes, device):
     """The energy of which is below 0 there; also with some locked coordinates."""
     declared = sheet(free_axes=free_axes)
     exact = newton_step(declared, device)
-    found, _ = after_one_step(declared, SOLVERS[name], device)
+    found, _ = after_steps(declared, SOLVERS[name], device)
     assert np.abs(found - exact).max() < 1e-9
-    few, _ = after_one_step(declared, wc.XPBD(substeps=1, iterations=3), device)
+    few, _ = after_steps(declared, wc.XPBD(substeps=1, iterations=3), device)
     assert np.abs(few - exact).max() > 1e-5, "few sweeps are not enough to say anything"
     heights = exact[:, 1] + 0.08
     assert heights.min() > 0.0 and -np.log(heights / 0.01).sum() < 0.0
 
 
 def test_pbd_keeps_above_the_floor(device):
-    stepper = wc.PBD(substeps=4, iterations=10).bind(sheet(duration=0.5).build(device=device))
-    for _ in range(30):
-        stepper.frame()
-        assert (stepper.state.x.numpy()[:, 1] > -0.08).all()
+    stepper = after_frames(sheet(duration=0.5), wc.PBD(substeps=4, iterations=10), device=device)
+    assert all((x[:, 1] > -0.08).all() for x in positions(stepper, 30))
 
 
 @pytest.mark.parametrize(

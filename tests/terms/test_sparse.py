@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, diags_array
 
 import warpcloth as wc
 from support.energies import FEW, energy_and_gradient, eps, every_dtype
-from support.steps import after_one_step, newton_step
+from support.steps import after_frames, after_steps, newton_step
 from warpcloth.core.hessian import Hessian
 from warpcloth.kernels.term import Term
 from warpcloth.solvers import SOLVERS
@@ -99,8 +99,7 @@ def test_gradient_and_hessian_are_differences(device):
     U, g = energy_and_gradient(model)
     hessian_ = Hessian(model)
     hessian_.assemble(model.positions, 0.0)
-    H = hessian_.matrix().toarray()
-    free = np.repeat(model.inverse_mass.numpy() > 0.0, 3)
+    H, free = hessian_.matrix().toarray(), np.repeat(model.inverse_mass.numpy() > 0.0, 3)
     found, columns = [], []
     for i in range(x.size):
         change = np.zeros(x.size)
@@ -131,9 +130,7 @@ def test_explicit_steps_end_where_newton_does(device):
     for substeps in (64, 128):
         ends = []
         for solver in (wc.Newton(substeps=substeps, tolerance=1e-9), wc.Explicit(substeps=substeps)):
-            stepper = solver.bind(sheet().build(device=device, dtype="float64"))
-            for _ in range(6):
-                stepper.frame()
+            stepper = after_frames(sheet(), solver, 6, device=device, dtype="float64")
             ends.append(stepper.state.x.numpy())
         apart.append(np.abs(ends[0] - ends[1]).max())
     assert apart[0] < 0.03 and apart[0] / apart[1] == pytest.approx(2.0, rel=0.2)
@@ -142,14 +139,12 @@ def test_explicit_steps_end_where_newton_does(device):
 @pytest.mark.parametrize("options", [{}, {"linear": "factorised"}, {"hessian": "absolute"}], ids=str)
 def test_newton_finds_the_minimum(options, device):
     """Its Hessian is that of the cells: within a few iterations at rounding, and as many copies as alone."""
-    exact = newton_step(sheet(), device)
-    solver = wc.Newton(substeps=1, tolerance=1e-10, **options)
-    x, stepper = after_one_step(sheet(), solver, device)
+    exact, solver = newton_step(sheet(), device), wc.Newton(substeps=1, tolerance=1e-10, **options)
+    x, stepper = after_steps(sheet(), solver, device)
     assert np.abs(x - exact).max() < 1e-9 and stepper.iterations < 30
-    both, _ = after_one_step(sheet(), solver, device, copies=2, vary={"Laplacian.stiffness": [20.0, 80.0]})
-    stiffer, _ = after_one_step(sheet([wc.Spring(stiffness=50.0), Laplacian(stiffness=80.0)]), solver, device)
-    assert np.abs(both - np.vstack([exact, stiffer])).max() < 1e-8
-    assert np.abs(stiffer - exact).max() > 1e-4
+    both, _ = after_steps(sheet(), solver, device, copies=2, vary={"Laplacian.stiffness": [20.0, 80.0]})
+    stiffer, _ = after_steps(sheet([wc.Spring(stiffness=50.0), Laplacian(stiffness=80.0)]), solver, device)
+    assert np.abs(both - np.vstack([exact, stiffer])).max() < 1e-8 and np.abs(stiffer - exact).max() > 1e-4
 
 
 def test_a_run_with_it_ends_well(device):
