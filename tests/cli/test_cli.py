@@ -390,8 +390,7 @@ def test_explicit_default_step_is_below_both_limits_and_one_less_is_not(capfd):
 
 
 @pytest.mark.parametrize(
-    ("command", "options"),
-    [("run", []), ("info", []), ("info", ["-s", "substeps=100"]), ("info", ["-s", "above_limit=allow"])],
+    ("command", "options"), [("run", []), ("info", []), ("info", ["-s", "substeps=100"]), ("info", ["-s", "above_limit=allow"])]
 )
 def test_explicit_looks_for_its_limits_once(tmp_path, capfd, monkeypatch, command, options):
     models, limits_of = [], explicit.step_limits

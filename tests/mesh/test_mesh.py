@@ -448,10 +448,7 @@ REFUSED = [
     (lambda: Mesh.chain(3, direction=(0, 0, 0)), r"direction is \(0, 0, 0\); it must not be zero"),
     (lambda: Mesh.chain(3, direction=(0, 1)), r"direction: has shape \(1, 2\)"),
     (lambda: Mesh.grid(3, 3).springs("bend"), "kind is 'bend'; it must be"),
-    (
-        lambda: Mesh(np.vstack([SQUARE[:3], [(0, 1, 0)]]), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]).corners(),
-        "closed",
-    ),
+    (lambda: Mesh(np.vstack([SQUARE[:3], [(0, 1, 0)]]), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]).corners(), "closed"),
 ]
 
 
@@ -478,13 +475,7 @@ def test_arrays_are_copies_and_read_only():
     points[0], triangles[0] = 7, 1
     assert mesh.points[0].tolist() == [0, 0, 0] and mesh.triangles[0].tolist() == [0, 2, 3]
     kinds = {"points": "f8", "triangles": "i4", "edges": "i4", "hinges": "i4", "boundary": "i4", "boundary_edges": "i4"}
-    kinds |= {
-        "isolated": "i4",
-        "edge_lengths": "f8",
-        "triangle_areas": "f8",
-        "vertex_areas": "f8",
-        "vertex_lengths": "f8",
-    }
+    kinds |= {"isolated": "i4", "edge_lengths": "f8", "triangle_areas": "f8", "vertex_areas": "f8", "vertex_lengths": "f8"}
     for name, kind in kinds.items():
         array = getattr(mesh, name)
         assert array.dtype == kind and not array.flags.writeable, name
@@ -575,10 +566,7 @@ def test_ply_stays_whole_at_seams(tmp_path):
     faces = "3 0 2 3 6 0 0 0 1 1 1\n3 0 3 1 6 .5 .5 0 .5 1 .5\n"
     (tmp_path / "cloth.ply").write_text(f"ply\nformat ascii 1.0\n{elements}end_header\n{points}{faces}")
     mesh = Mesh.load(tmp_path / "cloth.ply")
-    assert mesh.points.tolist() == [list(point) for point in SQUARE] and mesh.triangles.tolist() == [
-        [0, 2, 3],
-        [0, 3, 1],
-    ]
+    assert mesh.points.tolist() == [list(point) for point in SQUARE] and mesh.triangles.tolist() == [[0, 2, 3], [0, 3, 1]]
     assert mesh.texture_coordinates.tolist() == [[[0, 0], [0, 1], [1, 1]], [[0.5, 0.5], [0, 0.5], [1, 0.5]]]
 
 
@@ -669,10 +657,7 @@ def test_a_file_that_is_cut_is_no_other_mesh(tmp_path, ending):
     """At every byte: what loads at all is the whole mesh, without the line break at its end. A cut 11 would be 1."""
     mesh = Mesh.grid(4, 4)
     path = tmp_path / f"cut.{ending}"
-    text = {
-        "ply": HEAD.replace("vertex 4", "vertex 16").replace("face 2", "face 18"),
-        "off": "OFF\n16 18 0\n",
-    }[ending]
+    text = {"ply": HEAD.replace("vertex 4", "vertex 16").replace("face 2", "face 18"), "off": "OFF\n16 18 0\n"}[ending]
     text += "".join("{:.3f} {:.3f} {:.3f}\n".format(*point) for point in mesh.points)
     text += "".join("3 {} {} {}\n".format(*corners) for corners in mesh.triangles)
     loaded = []

@@ -402,11 +402,7 @@ def rendered_last(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("rate", "wanted"),
-    [
-        (24.0, [40, 40, 50, 40, 40, 40]),
-        (60.0, [30, 40, 30]),
-        (1000.0, [1000]),
-    ],
+    [(24.0, [40, 40, 50, 40, 40, 40]), (60.0, [30, 40, 30]), (1000.0, [1000])],
     ids=["24", "60, every second frame", "1000, too short for more than one"],
 )
 def test_a_gif_plays_in_real_time(rate, wanted, tmp_path):

@@ -272,11 +272,7 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
         ("a.json", ARCSIM.replace("[1, 1], ", ""), "a.json: bending is .*; it must be rows of numbers"),
         ("a.json", ARCSIM.replace("0.2", "-1"), "a.json: Fabric.density is -1"),
         ("a.json", '{"note": "für"}', "a.json: is no text in UTF-8, 'utf-8' codec can't decode byte 0xfc in position 11"),
-        (
-            "a.csv",
-            "name,W,EMT,WT,LT\nwool,20,4,8,99\n",
-            r"a.csv, line 2: LT of direction 1 is 99, but 2WT/.* is 0.8; must",
-        ),
+        ("a.csv", "name,W,EMT,WT,LT\nwool,20,4,8,99\n", r"a.csv, line 2: LT of direction 1 is 99, but 2WT/.* is 0.8; must"),
         ("a.txt", "", "a.txt: is a .txt; it must be .json of ARCSim or .csv"),
         ("a.csv", "name,W\nwool,1\n", "a.csv: has no columns of either KES-F"),
         ("a.csv", "name,W,LT,E5\nwool,1,1,1\n", "a.csv: has columns of both KES-F"),

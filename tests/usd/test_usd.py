@@ -449,18 +449,7 @@ def test_sequence_behaves_as_an_array(tmp_path):
     sequence = FrameSequence(write(tmp_path / "out.usdc", mesh))
     whole = np.asarray(sequence)
     assert whole.shape == sequence.shape and whole.dtype == np.float32 and sequence.ndim == 3
-    for key in (
-        (),
-        0,
-        -1,
-        slice(2, 7, 2),
-        slice(None, None, -1),
-        [1, 3],
-        (2, 5),
-        (slice(1, 3), 4, 0),
-        (..., 1),
-        np.int64(3),
-    ):
+    for key in ((), 0, -1, slice(2, 7, 2), slice(None, None, -1), [1, 3], (2, 5), (slice(1, 3), 4, 0), (..., 1), np.int64(3)):
         np.testing.assert_array_equal(sequence[key], whole[key])
     with pytest.raises(IndexError):
         sequence[FRAMES]
@@ -590,12 +579,7 @@ def topology(points, counts, indices):
         (two_meshes, "/Other", ValueError, "prim /Other: has no points"),
         (flattened, None, ValueError, "must be invertible"),
         (topology(PENTAGON, [2, 3], [0, 1, 2, 3, 4]), None, ValueError, "prim /Sheet: face 0 has 2 corners"),
-        (
-            topology(PENTAGON, [3, 3], [0, 1, 2, 3, 4]),
-            None,
-            ValueError,
-            "add up to 6, must be the number of indices, 5",
-        ),
+        (topology(PENTAGON, [3, 3], [0, 1, 2, 3, 4]), None, ValueError, "add up to 6, must be the number of indices, 5"),
         (topology(PENTAGON, [3], [0, 1, 6]), None, ValueError, r"faceVertexIndices\[2\] = 6, must be a vertex, 0 to 5"),
         (topology(PENTAGON, [3], [0, 1, 1]), None, ValueError, "prim /Sheet: triangles"),
         (topology(PENTAGON, [], []), None, ValueError, "prim /Sheet: has no faces"),

@@ -130,10 +130,7 @@ def test_pins_of_a_stage_from_blender(tmp_path, pins):
             f"float[] primvars:pins.timeSamples = {{1: {[1] * 12}, 2: {[0] * 12}}}",
             "primvars:pins changes over time, must have one",
         ),
-        (
-            SUBSET.format('token elementType = "edge"'),
-            "GeomSubset pins: elementType is 'edge', must be 'point' or 'face'",
-        ),
+        (SUBSET.format('token elementType = "edge"'), "GeomSubset pins: elementType is 'edge', must be 'point' or 'face'"),
         (SUBSET.format("int[] indices = [7]"), r"GeomSubset pins: indices\[0\] = 7, must be a face, 0 to 5"),
         ("custom int2 warpcloth:pins = (0, 4)", r"warpcloth:pins has type int2, must be string or int\[\]"),
         ('custom string warpcloth:pins = "left"', "'left'"),

@@ -634,27 +634,15 @@ def own(name, type_name, value):
         (own("freeAxes", "Int3Array", [(1, 1, 2)] * 9), r"warpcloth:freeAxes\[0\] has 2, must be 0 or 1 for each axis"),
         (own("freeAxes", "Int3Array", [(1, 1, 1)]), r"free_axes has shape \(1, 3\); it must be an array"),
         (own("mass", "Double", 1.0), "warpcloth:mass is no attribute of a cloth, must be one of .*density"),
-        (
-            {**OWN, "warpcloth:terms:threads:stiffness": ("Double", -1.0)},
-            r"stiffness is -1.0; it must be 0 or more",
-        ),
-        (
-            {**OWN, "warpcloth:terms:threads:stiffness": ("String", "stiff")},
-            r"has type string, must be double or double\[\]",
-        ),
-        (
-            {**OWN, "warpcloth:terms:threads:pairs": ("IntArray", [0, 1])},
-            r"has type int\[\], must be token or token\[\] or",
-        ),
+        ({**OWN, "warpcloth:terms:threads:stiffness": ("Double", -1.0)}, r"stiffness is -1.0; it must be 0 or more"),
+        ({**OWN, "warpcloth:terms:threads:stiffness": ("String", "stiff")}, r"has type string, must be double or double\[\]"),
+        ({**OWN, "warpcloth:terms:threads:pairs": ("IntArray", [0, 1])}, r"has type int\[\], must be token or token\[\] or"),
         (own("terms:threads:pairs", "Token", "knots"), "kind is 'knots'; it must be"),
         (own("density", "Double", -1.0), "density is -1.0; it must be a number above 0"),
         (own("masses", "DoubleArray", [1.0] * 9), "exactly one of density and masses"),
         (own("duration", "Double", 0.0), "warpcloth:duration is 0.0 s, must be finite and above 0"),
         (own("positions", "Double3Array", [(0, 0, 0)]), r"positions has shape \(1, 3\); it must be \(9, 3\)"),
-        (
-            {**OWN, "warpcloth:pins:keyframes": ("Double3Array", [(0, 0, 0)])},
-            "has 1 positions, must have one for each of 2",
-        ),
+        ({**OWN, "warpcloth:pins:keyframes": ("Double3Array", [(0, 0, 0)])}, "has 1 positions, must have one for each of 2"),
         (own("gridShape", "Int2", Gf.Vec2i(2, 2)), "grid_shape = .* must be the number of points, 9"),
     ],
 )

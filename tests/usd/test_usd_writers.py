@@ -19,15 +19,7 @@ import pytest
 
 from support.forks import Forks
 from support.rows import slow_but
-from support.stages import (
-    CHUNK,
-    FRAMES,
-    animated_prim,
-    anonymous_memory,
-    artist_stage,
-    motion,
-    write,
-)
+from support.stages import CHUNK, FRAMES, animated_prim, anonymous_memory, artist_stage, motion, write
 from support.usd_validation import validate
 from warpcloth.analysis.analysis import Analyzer
 from warpcloth.cli.reports import ReportFiles, write_report
