@@ -19,7 +19,7 @@ import pytest
 
 from support.forks import Forks
 from support.rows import slow_but
-from support.stages import CHUNK, FRAMES, animated_prim, anonymous_memory, artist_stage, motion, write
+from support.stages import CHUNK, FRAMES, animated_prim, anonymous_memory, artist_stage, full_from, motion, write
 from support.usd_validation import validate
 from warpcloth.analysis.analysis import Analyzer
 from warpcloth.cli.reports import ReportFiles, write_report
@@ -57,15 +57,7 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
     """A disk that is full at any of the steps leaves the earlier result, or the new one as far as it got."""
     mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdc"
     write(output, mesh, frames=30, sign=-1.0)
-    steps = iter(range(100))
-    replace = os.replace
-
-    def replace_until_full(*paths):
-        if next(steps) == step:
-            raise OSError("no space left on device")
-        replace(*paths)
-
-    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace_until_full)
+    full_from(step, monkeypatch)
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
     appended = 0
     try:
@@ -106,7 +98,7 @@ def test_a_reader_finds_a_whole_file_at_any_moment(tmp_path, monkeypatch, ending
         look()
 
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
-    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace)
+    monkeypatch.setattr(os, "replace", replace)
     for frame in range(FRAMES):
         writer.append(*motion(mesh, frame))
     writer.close(single_file=single_file)
@@ -202,23 +194,14 @@ def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
     assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES
 
 
-def spoil(folder, act):
-    """Changes a source, or the files of an output, during a run."""
-    stage, output = folder / "artist.usda", folder / "out.usdc"
-    if act == "delete":
-        stage.unlink()
-    elif act == "garble":
-        stage.write_text("garbage")
-    elif act == "triangles":
-        artist_stage(stage, Mesh.grid(3, 3))
-    elif act == "touch":
-        stage.write_text(stage.read_text() + "# said later\n")
-    elif act == "frames":
-        shutil.rmtree(folder / "out_frames")
-    elif act == "folder":
-        if output.exists():
-            output.unlink()
-        output.mkdir()
+SPOIL = {  # what changes a source, or the files of an output in a folder, during a run
+    "delete": lambda folder: (folder / "artist.usda").unlink(),
+    "garble": lambda folder: (folder / "artist.usda").write_text("garbage"),
+    "triangles": lambda folder: artist_stage(folder / "artist.usda", Mesh.grid(3, 3)),
+    "touch": lambda folder: (folder / "artist.usda").write_text((folder / "artist.usda").read_text() + "# said later\n"),
+    "frames": lambda folder: shutil.rmtree(folder / "out_frames"),
+    "folder": lambda folder: ((folder / "out.usdc").unlink(missing_ok=True), (folder / "out.usdc").mkdir()),
+}
 
 
 @pytest.mark.parametrize(
@@ -243,7 +226,7 @@ def test_what_changes_during_a_run_is_noticed(tmp_path, act, ending, single_file
             for frame in range(FRAMES):
                 writer.append(*motion(mesh, frame))
                 if frame == CHUNK:
-                    spoil(tmp_path, act)
+                    SPOIL[act](tmp_path)
         finally:
             writer.close(single_file=single_file)
     assert "\n" not in str(caught.value) and writer.kept == kept
@@ -274,7 +257,8 @@ def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
     ):
         for frame in range(FRAMES):
             writer.append(*motion(mesh, frame))
-            spoil(tmp_path, "touch" if frame == CHUNK else None)
+            if frame == CHUNK:
+                SPOIL["touch"](tmp_path)
     assert len(FrameSequence(tmp_path / f"out.{ending}")) == FRAMES
 
 
@@ -435,14 +419,7 @@ def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, forks, ending, with_s
 
 
 def check_survivor(output, mesh, log, source):
-    """The result of the run before is left, or frames of the last run, without its last chunk at most.
-
-    Args:
-        output: The output.
-        mesh: Its mesh.
-        log: A point for each append that had returned, a bar for each close.
-        source: The artist's stage, or "".
-    """
+    """The result before is left, or the last run but for its last chunk at most; the log has . for an append, | for a close."""
     runs = log.split("|")
     appended = len(runs[-1])
     last = (-1) ** (len(runs) - 1)
