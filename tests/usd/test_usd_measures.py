@@ -3,7 +3,6 @@
 import os
 import random
 import re
-import resource
 import shutil
 import signal
 import sys
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
+from support.disks import room_for
 from support.forks import Forks
 from support.stages import (
     CHUNK,
@@ -527,13 +527,8 @@ def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):
     path, layer = tmp_path / "a.usdc", Sdf.Layer.CreateAnonymous(".usdc")
     Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, "/A"), "x", Sdf.ValueTypeNames.FloatArray)
     layer.GetAttributeAtPath("/A.x").default = Vt.FloatArray.FromNumpy(np.random.default_rng(0).random(100_000, np.float32))
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
-            export(layer, path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with room_for(10_000), pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
+        export(layer, path)
     assert "pxrInternal" not in str(raised.value) and not path.exists()
 
 
