@@ -10,30 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.stage_texts import prim
 from warpcloth.cli import main
 from warpcloth.run import scene_files
 from warpcloth.solvers import SOLVERS
 from warpcloth.usd import FrameSequence
 
 ROOT = Path(__file__).parents[2]
-MESH = """    def Mesh "{name}"
-    {{
-        int[] faceVertexCounts = [3, 3]
-        int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
-        point3f[] points = [({at}, 0, 0), ({to}, 0, 0), ({at}, 0, 1), ({to}, 0, 1)]
-        double warpcloth:density = 0.15
-        token warpcloth:terms:threads:type = "Spring"
-        double warpcloth:terms:threads:stiffness = 1000
-        token warpcloth:terms:threads:pairs = "edges"
-        double warpcloth:duration = 0.125
-    }}
-"""
-TWO = (
-    '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\ndef Xform "World"\n{\n'
-    + MESH.format(name="Left", at=0, to=1)
-    + MESH.format(name="Right", at=3, to=4)
-    + "}\n"
-)
+CLOTH = """int[] faceVertexCounts = [3, 3]
+int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
+double warpcloth:density = 0.15
+token warpcloth:terms:threads:type = "Spring"
+double warpcloth:terms:threads:stiffness = 1000
+token warpcloth:terms:threads:pairs = "edges"
+double warpcloth:duration = 0.125"""
+POINTS = [f"point3f[] points = [({x}, 0, 0), ({x + 1}, 0, 0), ({x}, 0, 1), ({x + 1}, 0, 1)]" for x in (0, 3)]
+SHEETS = [prim("Mesh", name, CLOTH, points) for name, points in zip(("Left", "Right"), POINTS, strict=True)]
+HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n'
+TWO = HEAD + prim("Xform", "World", *SHEETS)
 
 
 def listed(capfd, *argv):

@@ -7,6 +7,7 @@ import pytest
 
 import warpcloth as wc
 from support.command_line import run
+from support.mesh_texts import usda
 from warpcloth.usd import read_scene, write_scene
 
 MESH = wc.Mesh.grid(4, 4, pattern="alternating")
@@ -149,25 +150,9 @@ def test_refusals_of_records(given, sentence):
         wc.Fabric(name="felt", **given)
 
 
-STAGE = """#usda 1.0
-(
-    defaultPrim = "Cloth"
-    metersPerUnit = 1
-    upAxis = "Y"
-)
-
-def Mesh "Cloth"
-{
-    int[] faceVertexCounts = [3, 3]
-    int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
-    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1)]
-    texCoord2f[] primvars:st = [(0, 0), (0, 1), (-1, 0), (-1, 1)] (
-        interpolation = "vertex"
-    )
-    token warpcloth:fabric = "silk"
-    DENSITY
-}
-"""
+POINTS, FACES = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1)], [(0, 2, 1), (1, 2, 3)]
+ST = 'texCoord2f[] primvars:st = [(0, 0), (0, 1), (-1, 0), (-1, 1)] (interpolation = "vertex")'
+STAGE = usda(POINTS, FACES, f'{ST}\ntoken warpcloth:fabric = "silk"\nDENSITY')
 
 
 def test_a_stage_names_one(tmp_path):
