@@ -103,10 +103,7 @@ def moves_the_same(scene, solver, random, tolerance, **build):
 @pytest.mark.parametrize("copies", slow_but([3], [1, 3]))
 @pytest.mark.parametrize("solver", slow_but(("newton", "pbd, averaged"), SOLVERS))
 def test_any_order_gives_the_same_motion(solver, copies, device):
-    """Of everything that a scene names by vertex or element, and that copies vary; the order need not be a good one.
-
-    float64 rounds by 1e-16, and iterations end at different roundings.
-    """
+    """Of everything that a scene names by vertex or element, and that copies vary; the order need not be a good one."""
     mesh = wc.Mesh.grid(6, 5, pattern="alternating")
     n, edges = len(mesh.points), len(mesh.edges)
     random = np.random.default_rng(5)
@@ -131,7 +128,7 @@ def test_any_order_gives_the_same_motion(solver, copies, device):
         "velocities": random.normal(scale=0.1, size=(copies, n, 3)),
     }
     build = {"device": device, "copies": copies, "vary": vary if copies > 1 else None}
-    moves_the_same(scene, SOLVERS[solver], random, 1e-9, **build)
+    moves_the_same(scene, SOLVERS[solver], random, 1e-9, **build)  # iterations end at different roundings, of 1e-16
 
 
 def test_bodies_move_the_same_in_any_order(device):

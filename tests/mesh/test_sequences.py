@@ -38,11 +38,7 @@ def frames(mesh=MESH, count=FRAMES):
 
 
 def cache(path, codes=(101, 102, 103, 104), rest=True, moving=True):
-    """Writes what another program may write: two quads in cm, z up, left-handed, under a group that turns and moves.
-
-    Returns:
-        Stage, prim, and the points of each frame in world space [m], (F, 6, 3).
-    """
+    """Two quads in cm, z up, left-handed, under a group that turns and moves: stage, prim, points in the world (F, 6, 3)."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     UsdGeom.SetStageUpAxis(stage, "Z")

@@ -458,12 +458,9 @@ def test_lumped_mass():
 
 def test_a_scene_prints_itself():
     lengths = np.full(EDGES, 0.1)
-    made = scene(
-        terms=[wc.Spring(stiffness=100.0, rest_lengths=lengths, name="warp"), wc.DihedralBending(stiffness=1e-4)],
-        pins=[0, 6],
-        duration=0.5,
-        name="curtain",
-    )
+    given = {"terms": [wc.Spring(stiffness=100.0, rest_lengths=lengths, name="warp"), wc.DihedralBending(stiffness=1e-4)]}
+    given |= {"pins": [0, 6], "duration": 0.5, "name": "curtain"}
+    made = scene(**given)
     text = str(made)
     parts = ("curtain", "35 vertices", "48 triangles", "82 edges", "mass 0.1 kg", "30 frames", "pins: 2")
     spring = "Spring(stiffness=100.0, name='warp', pairs='edges', rest_lengths=array(82,))"
@@ -845,10 +842,8 @@ def test_nothing_is_compiled_that_is_not_launched(probed):
 
 @pytest.mark.parametrize("name", slow_but(["xpbd"], SOLVERS))
 def test_binding_reads_no_elements_back(name, device, monkeypatch):
-    """Stencils, stiffness and rest states stay on the host until they are final, in an order of the model's own too.
-
-    On the CPU, where all is on the host, what reads them asks for what is kept.
-    """
+    """Stencils, stiffness and rest states stay on the host until they are final, in an order of the model's own too."""
+    # On the CPU, where all is on the host, what reads them asks for what is kept.
     mesh = wc.Mesh.grid(5, 5)
     terms = [wc.Spring(pairs=("structural", "shear"), stiffness=np.linspace(50.0, 100.0, 72), damping=0.01)]
     scene = wc.Scene(mesh, density=0.1, terms=[*terms, wc.QuadraticBending(stiffness=1e-5)], pins=[0, 4])

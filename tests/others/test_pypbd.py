@@ -61,16 +61,10 @@ def test_membranes_have_the_shear_and_stretch_of_the_corotated_energy():
     """Vertices that a small strain F moves to, all but one held, begin with the same acceleration, whatever the triangle."""
     mesh = wc.Mesh([[0, 0, 0], [1, 0.3, 0], [0.3, 0.8, 0.5]], [[0, 1, 2]])
     strain = np.array([[3.0, 1.0, 0.0], [1.0, -2.0, 4.0], [0.0, 4.0, 1.0]]) * 1e-5
-    scene = wc.Scene(
-        mesh,
-        masses=np.ones(3),
-        positions=mesh.points + mesh.points @ strain,
-        terms=[wc.CorotatedMembrane(stiffness=1e6)],
-        pins=[0],
-        gravity=(0.0, -1e-9, 0.0),
-        fps=1e6,
-        duration=1e-6,
-    )
+    given = {"masses": np.ones(3), "positions": mesh.points + mesh.points @ strain}
+    given |= {"terms": [wc.CorotatedMembrane(stiffness=1e6)], "pins": [0], "gravity": (0.0, -1e-9, 0.0), "fps": 1e6}
+    given |= {"duration": 1e-6}
+    scene = wc.Scene(mesh, **given)
     ours, found = (
         run.velocities[1] * 1e6
         for run in (

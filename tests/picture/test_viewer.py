@@ -59,15 +59,10 @@ def stage(tmp_path_factory):
     """A run with a ball that moves and a floor that does not, as a stage, and its points."""
     path = str(tmp_path_factory.mktemp("pages") / "fall.usdc")
     keys = np.linspace([0.0, 0.0, 0.0], [0.2, 0.0, 0.0], FRAMES)
-    scene = wc.Scene(
-        wc.Mesh.grid(6, 6),
-        density=0.1,
-        terms=[wc.Spring(stiffness=50.0)],
-        pins="corners and z == 0",
-        colliders=[wc.Sphere(radius=0.2, position=keys - [0.0, 0.4, 0.0]), wc.Plane(position=(0.0, -1.2, 0.0))],
-        fps=24.0,
-        duration=(FRAMES - 1) / 24.0,
-    )
+    given = {"density": 0.1, "terms": [wc.Spring(stiffness=50.0)], "pins": "corners and z == 0"}
+    given |= {"colliders": [wc.Sphere(radius=0.2, position=keys - [0.0, 0.4, 0.0]), wc.Plane(position=(0.0, -1.2, 0.0))]}
+    given |= {"fps": 24.0, "duration": (FRAMES - 1) / 24.0}
+    scene = wc.Scene(wc.Mesh.grid(6, 6), **given)
     wc.simulate(scene, wc.XPBD(substeps=4), output=path, single_file=True, dtype="float64")
     return path
 

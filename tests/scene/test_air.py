@@ -101,10 +101,8 @@ def test_a_hanging_strip_rests_at_the_angle_of_the_wind(wind, pressure, degrees,
 
 @each_solver
 def test_a_hanging_strip_stays_at_the_angle_of_the_wind(name, device):
-    """At 2 m/s for 0.2 s. A strip that hangs straight swings past this angle in that time.
-
-    What a tolerance of 1e-5 g leaves in a step would move the lower end of 0.2 m by 2e-6 m in that time, 1e-5 of the angle.
-    """
+    """At 2 m/s for 0.2 s. A strip that hangs straight swings past this angle in that time."""
+    # What a tolerance of 1e-5 g leaves in a step would move the lower end of 0.2 m by 2e-6 m then, 1e-5 of the angle.
     angle = slope_in(2.0)
     scene = replace(strip(2.0, angle), terms=[wc.Spring(stiffness=100.0, damping=0.01)], duration=0.2)
     solver = replace(SOLVERS[name], substeps=64 if name == "explicit" else 8)
@@ -132,12 +130,9 @@ def test_a_moving_observer_sees_the_same(name, device):
 
 @pytest.mark.parametrize("name", slow_but(["midpoint"], SOLVERS))
 def test_still_air_takes_energy(name, device):
-    """Without gravity: kinetic and elastic energy never rise, and fall by far more than the solver loses by itself.
-
-    Air 25 times as dense stops the sheet in a fraction of a second.
-    """
+    """Without gravity: kinetic and elastic energy never rise, and fall by far more than the solver loses by itself."""
     start = np.random.default_rng(2).normal(scale=0.5, size=(16, 3))
-    scene = sheet(velocities=start, gravity=(0.0, 0.0, 0.0), pins=[0], duration=0.1, air=wc.Air(density=30.0))
+    scene = sheet(velocities=start, gravity=(0.0, 0.0, 0.0), pins=[0], duration=0.1, air=wc.Air(density=30.0))  # stops soon
     damped = simulated(scene, SOLVERS[name], device, record="energies")
     total = damped.energies["kinetic"] + damped.energies["Spring"]
     assert np.diff(total).max() < (1e-2 if name == "explicit" else 1e-9) * total[0]  # symplectic Euler oscillates

@@ -25,13 +25,9 @@ def cloths():
     grid, other = wc.Mesh.grid(6, 6), wc.Mesh.grid(7, 5, pattern="alternating")
     other = wc.Mesh(other.points + np.array([2.0, 0.0, 0.0]), other.triangles)
     start = grid.points[[0, 5]]
-    heavy = wc.Scene(
-        grid,
-        density=0.4,
-        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)],
-        pins=wc.Pins([0, 5], keyframes=[start, start + np.array([0.0, 0.01, 0.0])]),
-        duration=0.1,
-    )
+    given = {"density": 0.4, "terms": [wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)]}
+    given |= {"pins": wc.Pins([0, 5], keyframes=[start, start + np.array([0.0, 0.01, 0.0])]), "duration": 0.1}
+    heavy = wc.Scene(grid, **given)
     light = wc.Scene(
         other,
         density=0.05,

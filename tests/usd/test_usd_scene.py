@@ -71,18 +71,11 @@ def hard_springs():
 
 def states():
     sheet, random = mesh(), np.random.default_rng(1)
-    return wc.Scene(
-        sheet,
-        masses=random.uniform(0.1, 0.2, len(sheet.points)),
-        positions=sheet.points @ [[0, 1, 0], [1, 0, 0], [0, 0, 1]] + 0.1,
-        velocities=random.normal(size=sheet.points.shape),
-        terms=[SPRING],
-        pins=[3, 0],
-        gravity=(0.1, 0.2, -1.62),
-        duration=0.3,
-        fps=30.0,
-        free_axes=random.random(sheet.points.shape) > 0.2,
-    )
+    given = {"masses": random.uniform(0.1, 0.2, len(sheet.points))}
+    given |= {"positions": sheet.points @ [[0, 1, 0], [1, 0, 0], [0, 0, 1]] + 0.1}
+    given |= {"velocities": random.normal(size=sheet.points.shape), "terms": [SPRING], "pins": [3, 0]}
+    given |= {"gravity": (0.1, 0.2, -1.62), "duration": 0.3, "fps": 30.0, "free_axes": random.random(sheet.points.shape) > 0.2}
+    return wc.Scene(sheet, **given)
 
 
 def keyframes():
