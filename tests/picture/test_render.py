@@ -12,6 +12,7 @@ from PIL import Image, ImageSequence
 
 import warpcloth as wc
 from support.command_line import refused, run
+from support.mesh_texts import obj
 from support.stage_texts import prim
 from warpcloth.cli import check as checking
 from warpcloth.cli import render as drawing
@@ -89,8 +90,7 @@ def folder(tmp_path_factory):
     np.save(found / "cloth.npy", MOTION)
     (found / "frames").mkdir()
     for k, points in enumerate(MOTION):
-        rows = [f"v {x} {y} {z}\n" for x, y, z in points] + [f"f {a} {b} {c}\n" for a, b, c in MESH.triangles + 1]
-        (found / "frames" / f"cloth_{10 + 2 * k}.obj").write_text("".join(rows))
+        (found / "frames" / f"cloth_{10 + 2 * k}.obj").write_text(obj(points, MESH.triangles.tolist()))
     shutil.copy(found / "frames" / "cloth_10.obj", found / "one.obj")
     chain = wc.Mesh.chain(4)
     with AnimationWriter(found / "chain.usdc", chain, FPS) as writer:
