@@ -126,18 +126,13 @@ def test_widths_of_curves_that_are_none(tmp_path, width):
     assert not (tmp_path / "out.usdc").exists()
 
 
-def test_a_missing_layer_elsewhere_is_a_warning(tmp_path, capfd):
-    (tmp_path / "cloth.usda").write_text(STAGE + 'def "Set" (references = @gone.usda@)\n{\n}\n')
-    with pytest.warns(UserWarning, match="^[^\n]*cloth.usda: In </Set>: Could not open asset @gone.usda@[^\n]*$"):
-        read_scene(tmp_path / "cloth.usda")
-    assert capfd.readouterr().err == ""
-
-
-def test_pins_may_stand_at_a_time_sample_alone(tmp_path):
+def test_a_missing_layer_elsewhere_is_a_warning_and_pins_may_stand_at_a_time_sample_alone(tmp_path, capfd):
     """The schema has an empty fallback for indices, which is not what the file says."""
-    path = tmp_path / "cloth.usda"
-    path.write_text(STAGE.replace("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [0, 1]}"))
-    assert read_scene(path).pins.vertices.tolist() == [0, 1]
+    text = STAGE.replace("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [0, 1]}")
+    (tmp_path / "cloth.usda").write_text(text + 'def "Set" (references = @gone.usda@)\n{\n}\n')
+    with pytest.warns(UserWarning, match="^[^\n]*cloth.usda: In </Set>: Could not open asset @gone.usda@[^\n]*$"):
+        assert read_scene(tmp_path / "cloth.usda").pins.vertices.tolist() == [0, 1]
+    assert capfd.readouterr().err == ""
 
 
 def test_holes_are_no_cloth(tmp_path):

@@ -151,11 +151,6 @@ def test_a_choice_is_made_for_the_pins_that_are_run(tmp_path, capfd, monkeypatch
     assert "seen" in capfd.readouterr().err and seen == [[0, 1, 2]]
 
 
-def test_the_package_is_a_command():
-    done = subprocess.run([sys.executable, "-m", "warpcloth", "--version"], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0 and done.stdout.startswith("warpcloth "), done.stderr
-
-
 COMPLETIONS = [
     ("deform bar", ["bar_twist"]),
     ("run hanging --solver xpbd -s substeps=4 sweep=", ["coloured", "sequential", "constraint-averaged"]),

@@ -481,10 +481,7 @@ def test_the_bar_has_round_numbers_and_fits(folder):
             assert len(set(texts)) == len(texts) > 1 and overlay.beside <= 0.4 * size[0]
             image = np.asarray(overlay.draw([np.full((size[1], size[0], 3), 255, np.uint8)], "1.00 s", True))
             assert image.shape == (size[1], size[0], 3) and (image != 255).any()
-
-
-def test_a_long_name_stays_beside_the_bar():
-    overlay = Overlay((320, 180), Scale(0.0, 1.0), "stretch_1", names=["a", "b" * 99])
+    overlay = Overlay((320, 180), Scale(0.0, 1.0), "stretch_1", names=["a", "b" * 99])  # a long name stays beside it
     image = np.asarray(overlay.draw([np.full((180, 160, 3), 255, np.uint8)] * 2))
     assert (image[:17, 160 : 320 - overlay.beside] < 128).any() and (image[:17, 320 - overlay.beside :] == 255).all()
 
@@ -681,16 +678,13 @@ def test_wrong_arguments_are_refused(source, options, message, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_not_installed_is_said(folder, tmp_path, capfd, monkeypatch):
-    real = rendering.check_film.__globals__["importlib"].util.find_spec
-    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "av" else real(name, *more))
-    refused(capfd, ["render", folder / "cloth.usdc", "-o", tmp_path / "a.mp4"], "films in .mp4 need PyAV: pip install")
-
-
-def test_a_source_is_not_written_over(folder, tmp_path, capfd):
+def test_a_source_is_not_written_over_and_what_is_not_installed_is_said(folder, tmp_path, capfd, monkeypatch):
     shutil.copy(folder / "one.obj", tmp_path / "a.obj")
     (tmp_path / "a.png").symlink_to(tmp_path / "a.obj")
     refused(capfd, ["render", tmp_path / "a.obj", "-o", tmp_path / "a.png", *SIZE], "is a link to")
+    real = rendering.check_film.__globals__["importlib"].util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name, *more: None if name == "av" else real(name, *more))
+    refused(capfd, ["render", folder / "cloth.usdc", "-o", tmp_path / "a.mp4"], "films in .mp4 need PyAV: pip install")
 
 
 @pytest.fixture

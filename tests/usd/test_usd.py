@@ -184,7 +184,7 @@ def test_what_a_sequence_cannot_read(tmp_path, attribute, message):
         FrameSequence(tmp_path / "a.usda", attribute=attribute)
 
 
-def test_rest_shape_is_the_default(result):
+def test_rest_shape_is_the_default_and_the_validators_pass(result):
     path, mesh, options, _ = result
     again = read_stage_mesh(path)
     span = max(np.abs(mesh.points).max(), np.linalg.norm(again.transform[3]))
@@ -193,10 +193,6 @@ def test_rest_shape_is_the_default(result):
     np.testing.assert_array_equal(again.mesh.edges, mesh.edges)
     for name, vertices in options.get("pins", {}).items():
         np.testing.assert_array_equal(again.pins[name], np.unique(vertices))
-
-
-def test_passes_the_validators(result):
-    path, _, options, _ = result
     assert validate(path, options.get("source")) == []
 
 
@@ -283,13 +279,6 @@ def test_scene_has_what_viewers_need(tmp_path):
     np.testing.assert_allclose(UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get(), mesh.texture_coordinates, atol=EPS)
     assert UsdGeom.Subset(prim.GetChild("row")).GetFamilyNameAttr().Get() == "pins"
     assert stage.GetRootLayer().customLayerData["warpcloth"] == {"prim": "/World/Cloth", "solver": "none", "dt": 0.01}
-
-
-def test_chain_is_one_curve_in_order(tmp_path):
-    mesh, options = chain(tmp_path)
-    _stage, prim = animated_prim(write(tmp_path / "a.usda", mesh, **options))
-    assert list(UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr().Get()) == [len(mesh.points)]
-    np.testing.assert_allclose(prim.GetAttribute("points").Get(), mesh.points, atol=EPS * 1.3)
 
 
 @each_way
@@ -395,7 +384,7 @@ def test_frames_that_were_opened_outlive_their_file(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["usda", "usdz"])
-def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
+def test_an_error_keeps_the_frames_before_it_and_no_frames_write_nothing(tmp_path, ending):
     mesh = Mesh.grid(5, 4)
     with pytest.raises(RuntimeError), AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=CHUNK) as writer:
         for frame in range(5):
@@ -403,11 +392,9 @@ def test_an_error_keeps_the_frames_before_it(tmp_path, ending):
         raise RuntimeError("diverged")
     assert len(FrameSequence(writer.path)) == 5
     assert validate(writer.path) == []
-
-
-def test_no_frames_write_nothing(tmp_path):
-    write(tmp_path / "out.usdz", Mesh.grid(3, 3), frames=0)
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "none").mkdir()
+    write(tmp_path / "none" / "out.usdz", mesh, frames=0)
+    assert list((tmp_path / "none").iterdir()) == []
 
 
 def test_sequence_behaves_as_an_array(tmp_path):
@@ -481,7 +468,12 @@ def test_samples_alone_are_read_with_a_warning(tmp_path):
     np.testing.assert_array_equal(read_mesh(path).points, PENTAGON)
 
 
-def test_periodic_curves_are_closed(tmp_path):
+def test_curves(tmp_path):
+    """A chain is one in its order; periodic ones are closed."""
+    mesh, options = chain(tmp_path)
+    _stage, prim = animated_prim(write(tmp_path / "chain.usda", mesh, **options))
+    assert list(UsdGeom.BasisCurves(prim).GetCurveVertexCountsAttr().Get()) == [len(mesh.points)]
+    np.testing.assert_allclose(prim.GetAttribute("points").Get(), mesh.points, atol=EPS * 1.3)
     stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     curves = UsdGeom.BasisCurves.Define(stage, "/Rope")

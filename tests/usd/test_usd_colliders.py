@@ -162,10 +162,7 @@ def test_colliders_follow_the_transforms_above_them(path, kind):
             np.testing.assert_allclose(turned(found, frame, found.points[[1]]), [at_frame + along], atol=1e-7)
     if kind == "Mesh":
         assert found.points.shape == (4, 3)  # a body, which is not stored at each frame
-
-
-def test_motion_is_read_until_a_frame_after_the_last(path):
-    """So that steps up to the last frame are computed as with all of it."""
+    # Motion is read until a frame after the last, so that steps up to the last frame are computed as with all of it.
     text = ops(translate={101: (0, 0, 0), 111: (100, 0, 0)})
     np.testing.assert_allclose(collider_of(path, shape("Sphere", text)).poses[:, 0], 0.1 * np.arange(6))
 
@@ -220,21 +217,14 @@ def test_approximations_of_a_mesh(path, approximation, kind, by, recwarn):
     np.testing.assert_allclose(distances, 0.0, atol=1e-7)  # the corners are on each of them
 
 
-def test_a_mesh_that_faces_inwards_is_said(path):
-    """All but its inside is solid then: a cloth in a closed room."""
+def test_meshes_that_face_inwards_or_are_flat(path):
+    """All but its inside is solid then: a cloth in a closed room. A mesh that is a collider is not the cloth."""
     room = ops(translate=(-500, -500, -500), scale=(500, 500, 500)) + INWARD
     with pytest.warns(UserWarning, match="prim /Thing: its triangles face inwards, so that what they enclose is free"):
         assert collider_of(path, shape("Mesh", room)).closed
-
-
-def test_a_flat_mesh_has_a_sphere_about_it(path):
     flat = TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)")
     ball = collider_of(path, shape("Mesh", 'token warpcloth:collider = "boundingSphere"' + flat))
     np.testing.assert_allclose([ball.radius, *ball.position], [0.1 * np.sqrt(0.5), 0.05, 0.05, 0], atol=1e-6)
-
-
-def test_a_mesh_that_is_a_collider_is_not_the_cloth(path):
-    collider_of(path, shape("Mesh", TETRAHEDRON))
     assert read_stage_mesh(path).prim == "/Cloth"
 
 
