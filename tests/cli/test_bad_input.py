@@ -44,7 +44,6 @@ OF_MESHES = [
     ('"leftHanded"', '"sideways"', "*orientation is 'sideways', must be one of rightHanded, leftHanded"),
     ("indices = [0, 1]", "indices = [0, 99]", r"*GeomSubset pins: indices\[1\] = 99, must be a point, 0 to 3"),
     ("indices = [0, 1]", "indices = [-1, 0]", r"GeomSubset pins: indices\[0\] = -1, must be a point"),
-    ('elementType = "point"', 'elementType = "edge"', "GeomSubset pins: elementType is 'edge', must be"),
     ("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [1]}", "1 GeomSubset pins: indices at time code 2, must"),
     ("double warpcloth:density = 0.15", "double warpcloth:density = nan", "warpcloth:density is nan, must be finite"),
     ("(0, -9.81, 0)", "(0, -inf, 0)", r"warpcloth:gravity\[1\] is -inf, must be finite"),

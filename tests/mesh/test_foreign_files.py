@@ -236,11 +236,7 @@ REFUSED = [  # name, content, where in the file, why
     ("materials.glb", glb(primitives=2), "", "has several geometries, name one of them"),
     ("cut.glb", glb()[:-9], "", "cannot be read as .glb"),
     ("pair.usda", usda(POINTS, [(0, 1)]), "prim /Sheet", "face 0 has 2 corners, must have at least 3"),
-    ("far.usda", usda(POINTS, [(0, 2, 9)]), "prim /Sheet", "faceVertexIndices"),
-    ("sum.usda", usda(POINTS, QUAD).replace("[4]", "[3]"), "prim /Sheet", "faceVertexCounts add up to 3"),
     ("empty.usda", usda([], []), "prim /Sheet", "has no points"),
-    ("hole.usda", usda(POINTS, QUAD, "int[] holeIndices = [1]"), "prim /Sheet", "holeIndices"),
-    ("curves.usda", "#usda 1.0\ndef Xform \"A\" {\n}\n", "", "has no Mesh prim"),
 ]  # fmt: skip
 
 

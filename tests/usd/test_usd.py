@@ -517,7 +517,6 @@ def topology(counts, indices, more=""):
         (TWO, "/Third", "prim /Third: there is no such prim, only /Sheet, /Other"),
         (TWO, "/Other", "prim /Other: has no points"),
         (topology(*PENTAGON_AND_TRIANGLE, FLAT), None, "must be invertible"),
-        (topology([2, 3], [0, 1, 2, 3, 4]), None, "prim /Sheet: face 0 has 2 corners"),
         (topology([3, 3], [0, 1, 2, 3, 4]), None, "add up to 6, must be the number of indices, 5"),
         (topology([3], [0, 1, 6]), None, r"faceVertexIndices\[2\] = 6, must be a vertex, 0 to 5"),
         (topology([3], [0, 1, 1]), None, "prim /Sheet: triangles"),

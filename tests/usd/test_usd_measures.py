@@ -1,12 +1,8 @@
 """Measures written over the stage that was measured, or on a stage of their own."""
 
 import os
-import random
 import re
 import shutil
-import signal
-import sys
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,7 +11,6 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from support.disks import room_for
-from support.forks import Forks
 from support.stages import (
     CHUNK,
     CODES,
@@ -23,7 +18,6 @@ from support.stages import (
     PENTAGON,
     PENTAGON_AND_TRIANGLE,
     animated_prim,
-    anonymous_memory,
     artist_stage,
     define_mesh,
     full_from,
@@ -486,43 +480,6 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step):
     assert len(stage.GetPrimAtPath(f"{prim.GetPath()}_corner").GetAttribute("points").GetTimeSamples()) == len(now)
 
 
-IMPORTS = """
-import itertools, sys
-sys.path[:0] = {path!r}
-from support.stages import measure
-from warpcloth.usd import read_stage_mesh
-"""
-VICTIM = """
-source = read_stage_mesh(given[1])
-print("ready", flush=True)
-for run in itertools.count():
-    measure(given[0], source.mesh, source, sign=(-1) ** run)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_killed_writer_leaves_a_readable_result(tmp_path):
-    mesh = Mesh.grid(40, 40)
-    path = artist_stage(tmp_path / "artist.usda", mesh)
-    moments, output = random.Random(1), tmp_path / "out.usdc"
-    measure(output, read_mesh(path), read_stage_mesh(path))
-    with Forks(IMPORTS.format(path=[str(Path(__file__).parents[1]), *sys.path])) as forks:
-        for trial in range(3):
-            said, ends = tmp_path / f"{trial}.txt", time.monotonic() + 60.0
-            victim = forks.start(VICTIM, said, str(output), path)
-            while not (said.exists() and said.read_text()) and time.monotonic() < ends:
-                time.sleep(0.001)
-            time.sleep(moments.uniform(0, 0.5))
-            os.kill(victim, signal.SIGKILL)
-            assert forks.wait() == -signal.SIGKILL and said.read_text() == "ready\n"
-            now = FrameSequence(output, attribute="primvars:stretch1")
-            sign = np.sign(now[0][5])
-            for frame, values in enumerate(now):
-                np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
-            assert len(now) in (3, 6, 7) and validate(output, path) == []
-
-
 def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):
     path, layer = tmp_path / "a.usdc", Sdf.Layer.CreateAnonymous(".usdc")
     Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, "/A"), "x", Sdf.ValueTypeNames.FloatArray)
@@ -530,20 +487,3 @@ def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):
     with room_for(10_000), pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
         export(layer, path)
     assert "pxrInternal" not in str(raised.value) and not path.exists()
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")
-def test_memory_stays_flat(tmp_path):
-    mesh = Mesh.grid(80, 80)
-    values = np.arange(len(mesh.triangles), dtype=np.float32)
-    colours = np.zeros((len(values), 3), np.float32)
-    writer = MeasureWriter(tmp_path / "a.usdc", mesh, {"a": "uniform"}, "a")
-    for frame in range(300):
-        if frame == 50:
-            before = anonymous_memory()
-        writer.append(frame, {"a": values + frame}, colours + np.float32(1e-3 * frame), points=mesh.points + 1e-3 * frame)
-    writing = anonymous_memory() - before
-    writer.close(single_file=True)
-    # As of an animation: a chunk of 10, its copy and what malloc keeps stay below 40 of the 250 frames.
-    frame_bytes = values.nbytes + colours.nbytes + mesh.points.nbytes  # points and normals, in float32
-    assert max(writing, anonymous_memory() - before) < 40 * frame_bytes
