@@ -267,12 +267,8 @@ def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, l
     (tmp_path / "utf8.usda").write_bytes(STAGE.encode().replace(b'"Spring"', b'"Spr\xff\xfeing"'))
     (tmp_path / "huge.usda").write_text(STAGE.replace("(1, 0, 0)", "(1e38, 0, 0)").replace("(0, 0, 1)", "(0, 0, -1e38)"))
     (tmp_path / "memory.py").write_text("def scene():\n    raise MemoryError\n")
-    raised = {
-        "later": "MemoryError('16 GiB')",
-        "device": "RuntimeError('Failed to allocate 3 bytes on device')",
-        "disk": "OSError(28, 'No space left on device')",
-        "deep": "RecursionError",
-    }
+    raised = {"later": "MemoryError('16 GiB')", "device": "RuntimeError('Failed to allocate 3 bytes on device')"}
+    raised |= {"disk": "OSError(28, 'No space left on device')", "deep": "RecursionError"}
     for name, error in raised.items():  # past what is said of a scene file, as in a step
         text = f"import warpcloth as wc\nclass Broken(wc.Scene):\n    def build(self, **_):\n        raise {error}\n"
         make = "def scene():\n    return Broken(wc.Mesh.grid(3, 3), density=1.0, terms=[wc.Spring(stiffness=1.0)])\n"

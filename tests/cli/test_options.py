@@ -62,12 +62,8 @@ def test_options_are_listed_from_the_record(name, capfd):
 
 def test_parameters_are_listed_of_a_known_scene_a_file_and_a_stage(tmp_path, capfd):
     assert listed(capfd, "run", "net", "-p", "help")["kind"]["allowed"] == "one of structural, shear, bending"
-    assert listed(capfd, "info", "hanging", "-p", "help")["n"] == {
-        "name": "n",
-        "default": 32,
-        "needed": False,
-        "allowed": "a whole number",
-    }
+    n = {"name": "n", "default": 32, "needed": False, "allowed": "a whole number"}
+    assert listed(capfd, "info", "hanging", "-p", "help")["n"] == n
     (tmp_path / "needs.py").write_text("def scene(n: int, flat: bool = False):\n    return n\n", encoding="utf-8")
     assert main(["run", str(tmp_path / "needs.py"), "-p", "help"]) == 0
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]

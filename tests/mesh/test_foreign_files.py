@@ -135,12 +135,8 @@ def glb(indices=(0, 2, 1, 1, 2, 3), points=POINTS, mode=4, kind=5123, node=None,
     accessors = [{"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3"}]
     accessors += [{"bufferView": 1, "componentType": kind, "count": len(indices or ()), "type": "SCALAR"}] * bool(listed)
     primitive = {"attributes": {"POSITION": 0}, "mode": mode} | ({"indices": 1} if listed else {})
-    tree = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "a", **(node or {})}],
-    }
+    tree = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}]}
+    tree |= {"nodes": [{"mesh": 0, "name": "a", **(node or {})}]}
     tree |= {"meshes": [{"primitives": [primitive] * primitives}], "accessors": accessors, "bufferViews": views}
     tree |= {"buffers": [{"byteLength": len(data + listed)}], "extensionsRequired": list(required)}
     text = json.dumps(tree).encode()

@@ -106,24 +106,20 @@ def test_any_order_gives_the_same_motion(solver, copies, device):
     random = np.random.default_rng(5)
     positions = mesh.points * [1.01, 1.0, 1.02]
     keyframes = positions[[4, 0]] + 0.01 * np.arange(6)[:, None, None] * [1.0, 2.0, 0.0]
-    scene = wc.Scene(
-        mesh,
-        masses=random.uniform(1e-3, 2e-3, n),
-        positions=positions,
-        velocities=random.normal(scale=0.1, size=(n, 3)),
-        terms=[
-            wc.Spring(stiffness=random.uniform(50.0, 100.0, edges), rest_lengths=random.uniform(0.19, 0.21, edges)),
-            wc.QuadraticBending(stiffness=random.uniform(1e-4, 1e-3, len(mesh.hinges))),
-            wc.Attachment(vertices=[7, 29], targets=[[0.0, 0.5, 0.0], [1.0, 0.2, 1.0]], stiffness=[1.0, 2.0]),
-        ],
-        pins=wc.Pins([4, 0], keyframes),
-        duration=0.1,
-    )
-    vary = {
-        "masses": random.uniform(1e-3, 2e-3, (copies, n)),
-        "Spring.stiffness": random.uniform(50.0, 100.0, (copies, edges)),
-        "velocities": random.normal(scale=0.1, size=(copies, n, 3)),
+    lengths = random.uniform(0.19, 0.21, edges)
+    terms = [
+        wc.Spring(stiffness=random.uniform(50.0, 100.0, edges), rest_lengths=lengths),
+        wc.QuadraticBending(stiffness=random.uniform(1e-4, 1e-3, len(mesh.hinges))),
+        wc.Attachment(vertices=[7, 29], targets=[[0.0, 0.5, 0.0], [1.0, 0.2, 1.0]], stiffness=[1.0, 2.0]),
+    ]
+    start = {
+        "positions": positions,
+        "velocities": random.normal(scale=0.1, size=(n, 3)),
+        "masses": random.uniform(1e-3, 2e-3, n),
     }
+    scene = wc.Scene(mesh, terms=terms, pins=wc.Pins([4, 0], keyframes), duration=0.1, **start)
+    vary = {"masses": random.uniform(1e-3, 2e-3, (copies, n)), "Spring.stiffness": random.uniform(50.0, 100.0, (copies, edges))}
+    vary |= {"velocities": random.normal(scale=0.1, size=(copies, n, 3))}
     build = {"device": device, "copies": copies, "vary": vary if copies > 1 else None}
     moves_the_same(scene, SOLVERS[solver], random, 1e-9, **build)  # iterations end at different roundings, of 1e-16
 

@@ -468,17 +468,18 @@ def test_a_scene_prints_itself():
 
 # --- the report
 
+
+def all_terms(spring=100.0, bend=1e-3, hold=10.0):
+    hinges = [wc.QuadraticBending(stiffness=1e-3), wc.DihedralBending(stiffness=bend, name="bend")]
+    return [wc.Spring(stiffness=spring), *hinges, wc.Attachment(vertices="corners", stiffness=hold)]
+
+
 TERMS = {
     "none": [],
     "one value": [wc.Spring(stiffness=100.0)],
+    "all": [replace(term, name=None) for term in all_terms()],
     "hard": [wc.Spring(stiffness=np.inf)],
     "of each element": [wc.Spring(stiffness=np.linspace(1.0, 2.0, EDGES))],
-    "all": [
-        wc.Spring(stiffness=100.0),
-        wc.QuadraticBending(stiffness=1e-3),
-        wc.DihedralBending(stiffness=1e-3),
-        wc.Attachment(vertices="corners", stiffness=10.0),
-    ],
 }
 
 
@@ -556,15 +557,6 @@ VARIED = {
 }
 
 
-def all_terms(spring=100.0, bend=1e-3, hold=10.0):
-    return [
-        wc.Spring(stiffness=spring),
-        wc.QuadraticBending(stiffness=1e-3),
-        wc.DihedralBending(stiffness=bend, name="bend"),
-        wc.Attachment(vertices="corners", stiffness=hold),
-    ]
-
-
 def stretched(model):
     """U (B,) and ∂U/∂x (B, n, 3) of copies that are a little larger than where they start."""
     energy, gradient = energy_and_gradient(model, model.positions.numpy() * 1.05)
@@ -613,11 +605,8 @@ def test_sums_and_maxima(dtype, device, monkeypatch):
         launch(*given, out)
         return out.numpy()
 
-    exact = {
-        "sum": values.sum(axis=1),
-        "dot": (a * b.astype(float)).sum(axis=(1, 2)),
-        "rows": (c * d.astype(float)).sum(axis=1),
-    }
+    exact = {"sum": values.sum(axis=1), "dot": (a * b.astype(float)).sum(axis=(1, 2))}
+    exact |= {"rows": (c * d.astype(float)).sum(axis=1)}
     measured = {
         "sum": found(lambda each, out: of_vertices.sum(each, n, out), array(values, wp.float64)),
         "dot": found(lambda *each: of_vertices.dot(*each, active), array(a, model.vec3), array(b, model.vec3)),

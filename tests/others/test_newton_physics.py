@@ -57,13 +57,8 @@ def test_arrays_are_those_of_the_scene_to_the_bit(method):
     terms = [replace(springs, damping=None) if method == "style3d" else longer, wc.QuadraticBending(stiffness=1e-3)]
     scene = declared(positions=positions, velocities=velocities, terms=terms, gravity=(1.0, -2.0, 3.0), colliders=COLLIDERS)
     model = newton_model(scene, method)
-    expected = {
-        "particle_q": positions,
-        "particle_qd": velocities,
-        "particle_mass": scene.vertex_masses,
-        "particle_radius": np.full(16, scene.contact.distance),
-        "gravity": scene.gravity[None],
-    }
+    expected = {"particle_q": positions, "particle_qd": velocities, "particle_mass": scene.vertex_masses}
+    expected |= {"particle_radius": np.full(16, scene.contact.distance), "gravity": scene.gravity[None]}
     if method == "style3d":
         expected["tri_indices"] = MESH.triangles
         assert model.spring_count == 0

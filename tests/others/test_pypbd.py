@@ -65,13 +65,9 @@ def test_membranes_have_the_shear_and_stretch_of_the_corotated_energy():
     given |= {"terms": [wc.CorotatedMembrane(stiffness=1e6)], "pins": [0], "gravity": (0.0, -1e-9, 0.0), "fps": 1e6}
     given |= {"duration": 1e-6}
     scene = wc.Scene(mesh, **given)
-    ours, found = (
-        run.velocities[1] * 1e6
-        for run in (
-            wc.simulate(scene, wc.Explicit(substeps=1), dtype="float64", frames=1),
-            run_other(scene, PositionBasedDynamics("pbd", 1), frames=1),
-        )
-    )
+    runs = [wc.simulate(scene, wc.Explicit(substeps=1), dtype="float64", frames=1)]
+    runs.append(run_other(scene, PositionBasedDynamics("pbd", 1), frames=1))
+    ours, found = (run.velocities[1] * 1e6 for run in runs)
     assert np.abs(ours).max() > 5.0
     np.testing.assert_allclose(found, ours, rtol=0.0, atol=1e-4 * np.abs(ours).max())
 

@@ -99,13 +99,8 @@ def test_a_legend_is_plain_and_survives_a_stage(scale, tmp_path):
 
     legend = scale.legend("stretch_1", "1")
     assert json.loads(json.dumps(legend, allow_nan=False)) == legend
-    assert [legend[key] for key in ("measure", "unit", "map", "low", "high")] == [
-        "stretch_1",
-        "1",
-        scale.map,
-        scale.low,
-        scale.high,
-    ]
+    expected = {"measure": "stretch_1", "unit": "1", "map": scale.map, "low": scale.low, "high": scale.high}
+    assert {key: legend[key] for key in expected} == expected
     assert legend.get("neutral") == scale.neutral
     stops = [legend[f"stop_{k}"] for k in range(9)]
     assert [stops[0]["value"], stops[-1]["value"]] == [scale.low, scale.high] and "stop_9" not in legend

@@ -255,10 +255,8 @@ def test_normals_point_to_the_front(tmp_path, orientation, scale):
     front = 1 if orientation == "rightHanded" else -1
     for code in (Usd.TimeCode.Default(), 104):
         points, normals = (np.array(prim.GetAttribute(name).Get(code)) for name in ("points", "normals"))
-        across = np.cross(
-            points[ball.triangles[:, 1]] - points[ball.triangles[:, 0]],
-            points[ball.triangles[:, 2]] - points[ball.triangles[:, 0]],
-        )
+        a, b, c = points[ball.triangles].swapaxes(0, 1)
+        across = np.cross(b - a, c - a)
         assert (front * np.einsum("tki,ti->tk", normals[ball.triangles], across) > 0).all()
     # Read back, triangle normals are the front in world space, mirrored or not.
     mesh = read_mesh(path)

@@ -167,14 +167,11 @@ def test_colliders_follow_the_transforms_above_them(path, kind):
     np.testing.assert_allclose(collider_of(path, shape("Sphere", text)).poses[:, 0], 0.1 * np.arange(6))
 
 
+RISING = TETRAHEDRON.replace("points =", "points.timeSamples = {101:").rstrip()
 DEFORMING = {
     "scale": ("Cube", "double size = 20\n" + scaled({101: (1, 1, 1), 105: (1, 1, 3)})),
     "size": ("Cube", "double size.timeSamples = {101: 20, 105: 60}"),
-    "points": (
-        "Mesh",
-        TETRAHEDRON.replace("points =", "points.timeSamples = {101:").rstrip()
-        + ", 105: [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 30)]}",
-    ),
+    "points": ("Mesh", RISING + ", 105: [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 30)]}"),
 }
 
 
@@ -350,13 +347,11 @@ REFUSED = [  # kind and text of the shape, message about it
 ]
 INSIDE = shape("Sphere", "double radius = 90\n" + at(0, 0, 200))
 REFUSED_TEXTS = [(shape(kind, text), f"prim /Thing: {message}") for kind, text, message in REFUSED]
+GONE = COLLIDES.replace(")", "\nprepend payload = @./gone.usda@)")
 REFUSED_TEXTS += [
     (shape("PointInstancer", shape("Sphere"), "Many", ""), "prim /Many: has a collider as a prototype, which must be"),
     (INSIDE, "prim /Cloth: vertex 0 starts 0.9 m inside the collider /Thing"),
-    (
-        shape("Sphere", meta=COLLIDES.replace(")", "\nprepend payload = @./gone.usda@)")),
-        "prim /Thing: .*gone.usda.* must be there",
-    ),
+    (shape("Sphere", meta=GONE), "prim /Thing: .*gone.usda.* must be there"),
 ]
 
 
