@@ -2,7 +2,6 @@
 
 import os
 import re
-import resource
 import shutil
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import warp as wp
 from pxr import Sdf, Usd
 
 import warpcloth as wc
+from support.disks import room_for
 from support.stage_texts import CURVES, MOVED, STAGE
 from warpcloth.base import limits, warp_internals
 from warpcloth.base.quiet import initialise_warp
@@ -24,100 +24,50 @@ from warpcloth.cli.terminal import printable
 from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, packages, read_scene
 from warpcloth.usd.values import value_of
 
-WRONG_STAGES = [  # the text, what stands in place of a part of it, the sentence after the path
-    (STAGE, "metersPerUnit = 1", "metersPerUnit = -1", r"metersPerUnit is -1.0, must be a number of 1e-18 to 1e\+18"),
-    (STAGE, "kilogramsPerUnit = 1", "kilogramsPerUnit = nan", "kilogramsPerUnit is nan, must be"),
-    (STAGE, '"Y"', '"X"', 'upAxis is \'X\', must be "Y" or "Z"'),
-    (
-        STAGE,
-        "timeCodesPerSecond = 24",
-        "timeCodesPerSecond = 0",
-        r"timeCodesPerSecond is 0.0, must be a number of 1e-06 to 1e\+06",
-    ),
-    (STAGE, "timeCodesPerSecond = 24", "timeCodesPerSecond = -24", "timeCodesPerSecond is -24.0, must be"),
-    (STAGE, "framesPerSecond = 24", "framesPerSecond = inf", "framesPerSecond is inf, must be"),
-    (STAGE, "startTimeCode = 0", "startTimeCode = -1e18", r"startTimeCode is -1e\+18, must be a number of -1e\+09 to 1e\+09"),
-    (STAGE, "endTimeCode = 3", "endTimeCode = inf", "endTimeCode is inf, must be a number of"),
-    (STAGE, "endTimeCode = 3", "endTimeCode = -3", "endTimeCode is -3, must be at least startTimeCode, which is 0"),
-    (
-        STAGE,
-        "double warpcloth:density = 0.15",
-        "double warpcloth:density.timeSamples = { 0: 0.15, 3: 0.3 }",
-        "prim /Cloth: warpcloth:density changes over time, must have one value",
-    ),
-    (STAGE, "3: [(0, 0.1", "1e15: [(0, 0.1", r"prim /Cloth: points has a sample at time code 1e\+15, must be at -1e\+09"),
-    (
-        STAGE,
-        "1: [(0, 0, 0), (1",
-        "1e15: [(0, 0, 0), (1",
-        r"prim /Cloth: warpcloth:pins:keyframes has a sample at time code 1e\+15",
-    ),
-    (
-        MOVED,
-        "(1, 0.1, 0), (0, 0, 1)",
-        "(1, 0.1, 0), (0, nan, 1)",
-        r"prim /Cloth: points\[2\]\[1\] at time code 1 is nan, must be finite",
-    ),
-    (MOVED, "[(0, 0.1, 0), (1, 0.1, 0), (0, 0, 1), (1, 0, 1)]", "None", "prim /Cloth: points is blocked at time code 3, must"),
-    (STAGE, "(0, 0, 0), (1, 0, 0)]}", "(0, inf, 0), (1, 0, 0)]}", r"keyframes\[0\]\[1\] at time code 1 is inf, must be finite"),
-    (STAGE, "Indices = [0, 2", "Indices = [0, -2", r"prim /Cloth: faceVertexIndices\[1\] = -2, must be a vertex, 0 to 3"),
-    (STAGE, "int[] faceVertexCounts = [3, 3]", "float[] faceVertexCounts = [3, 3]", "faceVertexCounts holds float32 of shape"),
-    (
-        CURVES,
-        "point3f[] points = [(0, -0, 0), (0, -0.25, 0), (0, -0.5, 0), (0, -0.75, 0), (0, -1, 0)]",
-        "int[] points = [1, 2]",
-        "points holds int32 of",
-    ),
-    (STAGE, '"leftHanded"', '"sideways"', "prim /Cloth: orientation is 'sideways', must be one of rightHanded, leftHanded"),
-    (
-        STAGE,
-        "indices = [0, 1]",
-        "indices = [0, 99]",
-        r"prim /Cloth: GeomSubset pins: indices\[1\] = 99, must be a point, 0 to 3",
-    ),
-    (STAGE, "indices = [0, 1]", "indices = [-1, 0]", r"GeomSubset pins: indices\[0\] = -1, must be a point"),
-    (STAGE, 'elementType = "point"', 'elementType = "edge"', "GeomSubset pins: elementType is 'edge', must be"),
-    (STAGE, "indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [1]}", "1 GeomSubset pins: indices at time code 2, must"),
-    (STAGE, "double warpcloth:density = 0.15", "double warpcloth:density = nan", "warpcloth:density is nan, must be finite"),
-    (STAGE, "(0, -9.81, 0)", "(0, -inf, 0)", r"warpcloth:gravity\[1\] is -inf, must be finite"),
-    (STAGE, "stiffness = 1000", "stiffness = nan", "warpcloth:terms:threads:stiffness is nan, must be a number"),
-    (STAGE, "density = 0.15", "density.timeSamples = {0: None}", "warpcloth:density is blocked at its first time sample, must"),
-    (
-        STAGE,
-        "int[] faceVertexCounts = [3, 3]",
-        "int[] faceVertexCounts.timeSamples = {0: [3, 3], 3: [3]}",
-        "prim /Cloth: 1 faceVertexCounts at time code 3, must stay 2",
-    ),
-    (
-        STAGE,
-        "int[] faceVertexCounts",
-        "int[] holeIndices = [2]\n    int[] faceVertexCounts",
-        r"holeIndices\[0\] = 2, must be a face",
-    ),
-    (
-        STAGE,
-        "(\n    defaultPrim",
-        "(\n    subLayers = [@gone.usda@]\n    defaultPrim",
-        "Could not load sublayer @gone.usda@ .*must be",
-    ),
-    (
-        STAGE,
-        'def Mesh "Cloth"\n',
-        'def Mesh "Cloth" (references = @gone.usda@)\n',
-        "prim /Cloth: Could not open asset @gone.usda@",
-    ),
-    (CURVES, "[5]", "[9]", "prim /Cloth: curveVertexCounts add up to 9, must be the number of points, 5"),
-    (CURVES, "[5]", "[2147483647]", "curveVertexCounts add up to 2147483647, must be the number of points, 5"),
-    (CURVES, "[5]", "[6, -1]", r"curveVertexCounts\[1\] is -1, must be at least 2"),
-    (CURVES, "indices = [0]", "indices = [99]", r"GeomSubset pins: indices\[0\] = 99, must be a point, 0 to 4"),
-    (CURVES, '"nonperiodic"', '"round"', "wrap is 'round', must be one of nonperiodic, periodic, pinned"),
-    (
-        CURVES,
-        "int[] primvars:warpcloth:vertex = [0, 1, 2, 3, 4]",
-        'string[] primvars:warpcloth:vertex = ["a"]',
-        "holds <U1 of shape",
-    ),
+# What stands in place of a part of a text, and the sentence after the path, with * for the prim.
+OF_MESHES = [
+    ("metersPerUnit = 1", "metersPerUnit = -1", r"metersPerUnit is -1.0, must be a number of 1e-18 to 1e\+18"),
+    ("kilogramsPerUnit = 1", "kilogramsPerUnit = nan", "kilogramsPerUnit is nan, must be"),
+    ('"Y"', '"X"', 'upAxis is \'X\', must be "Y" or "Z"'),
+    ("timeCodesPerSecond = 24", "timeCodesPerSecond = 0", r"timeCodesPerSecond is 0.0, must be a number of 1e-06 to 1e\+06"),
+    ("timeCodesPerSecond = 24", "timeCodesPerSecond = -24", "timeCodesPerSecond is -24.0, must be"),
+    ("framesPerSecond = 24", "framesPerSecond = inf", "framesPerSecond is inf, must be"),
+    ("startTimeCode = 0", "startTimeCode = -1e18", r"startTimeCode is -1e\+18, must be a number of -1e\+09 to 1e\+09"),
+    ("endTimeCode = 3", "endTimeCode = inf", "endTimeCode is inf, must be a number of"),
+    ("endTimeCode = 3", "endTimeCode = -3", "endTimeCode is -3, must be at least startTimeCode, which is 0"),
+    ("y = 0.15", "y.timeSamples = {0: 0.15, 3: 0.3}", "*warpcloth:density changes over time, must have one value"),
+    ("3: [(0, 0.1", "1e15: [(0, 0.1", r"*points has a sample at time code 1e\+15, must be at -1e\+09"),
+    ("1: [(0, 0, 0), (1", "1e15: [(0, 0, 0), (1", r"*warpcloth:pins:keyframes has a sample at time code 1e\+15"),
+    ("(0, 0, 0), (1, 0, 0)]}", "(0, inf, 0), (1, 0, 0)]}", r"keyframes\[0\]\[1\] at time code 1 is inf, must be finite"),
+    ("Indices = [0, 2", "Indices = [0, -2", r"*faceVertexIndices\[1\] = -2, must be a vertex, 0 to 3"),
+    ("int[] faceVertexCounts = [3, 3]", "float[] faceVertexCounts = [3, 3]", "faceVertexCounts holds float32 of shape"),
+    ('"leftHanded"', '"sideways"', "*orientation is 'sideways', must be one of rightHanded, leftHanded"),
+    ("indices = [0, 1]", "indices = [0, 99]", r"*GeomSubset pins: indices\[1\] = 99, must be a point, 0 to 3"),
+    ("indices = [0, 1]", "indices = [-1, 0]", r"GeomSubset pins: indices\[0\] = -1, must be a point"),
+    ("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [1]}", "1 GeomSubset pins: indices at time code 2, must"),
+    ("double warpcloth:density = 0.15", "double warpcloth:density = nan", "warpcloth:density is nan, must be finite"),
+    ("(0, -9.81, 0)", "(0, -inf, 0)", r"warpcloth:gravity\[1\] is -inf, must be finite"),
+    ("stiffness = 1000", "stiffness = nan", "warpcloth:terms:threads:stiffness is nan, must be a number"),
+    ("density = 0.15", "density.timeSamples = {0: None}", "warpcloth:density is blocked at its first time sample, must"),
+    ("Counts = [3, 3]", "Counts.timeSamples = {0: [3, 3], 3: [3]}", "*1 faceVertexCounts at time code 3, must stay 2"),
+    ("int[] faceVertexCounts", "int[] holeIndices = [2]\n    int[] faceVertexCounts", r"holeIndices\[0\] = 2, must be a face"),
+    ("    defaultPrim", "subLayers = [@gone.usda@]\n    defaultPrim", "Could not load sublayer @gone.usda@ .*must be"),
+    ('def Mesh "Cloth"\n', 'def Mesh "Cloth" (references = @gone.usda@)\n', "*Could not open asset @gone.usda@"),
 ]
+OF_MOTIONS = [
+    ("(1, 0.1, 0), (0, 0, 1)", "(1, 0.1, 0), (0, nan, 1)", r"*points\[2\]\[1\] at time code 1 is nan, must be finite"),
+    ("[(0, 0.1, 0), (1, 0.1, 0), (0, 0, 1), (1, 0, 1)]", "None", "*points is blocked at time code 3, must"),
+]
+OF_CURVES = [
+    ("point3f[] points", "int[] points = [1, 2]\n    point3f[] others", "points holds int32 of"),
+    ("[5]", "[9]", "*curveVertexCounts add up to 9, must be the number of points, 5"),
+    ("[5]", "[2147483647]", "curveVertexCounts add up to 2147483647, must be the number of points, 5"),
+    ("[5]", "[6, -1]", r"curveVertexCounts\[1\] is -1, must be at least 2"),
+    ("indices = [0]", "indices = [99]", r"GeomSubset pins: indices\[0\] = 99, must be a point, 0 to 4"),
+    ('"nonperiodic"', '"round"', "wrap is 'round', must be one of nonperiodic, periodic, pinned"),
+    ("int[] primvars:warpcloth:vertex = [0, 1, 2, 3, 4]", 'string[] primvars:warpcloth:vertex = ["a"]', "holds <U1 of shape"),
+]
+WRONG_STAGES = [(text, *row) for text, rows in ((STAGE, OF_MESHES), (MOVED, OF_MOTIONS), (CURVES, OF_CURVES)) for row in rows]
 
 
 @pytest.mark.parametrize(("text", "old", "new", "message"), WRONG_STAGES, ids=[row[2][:40] for row in WRONG_STAGES])
@@ -125,7 +75,7 @@ def test_wrong_stages(tmp_path, capfd, text, old, new, message):
     assert text.count(old) >= 1
     path = tmp_path / "cloth.usda"
     path.write_text(text.replace(old, new))
-    with pytest.raises(ValueError, match=message) as caught:
+    with pytest.raises(ValueError, match=re.sub(r"^\*", "prim /Cloth: ", message)) as caught:
         read_scene(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
     assert capfd.readouterr().err == ""
@@ -175,18 +125,13 @@ def test_widths_of_curves_that_are_none(tmp_path, width):
     assert not (tmp_path / "out.usdc").exists()
 
 
-def test_a_missing_layer_elsewhere_is_a_warning(tmp_path, capfd):
-    (tmp_path / "cloth.usda").write_text(STAGE + 'def "Set" (references = @gone.usda@)\n{\n}\n')
-    with pytest.warns(UserWarning, match="^[^\n]*cloth.usda: In </Set>: Could not open asset @gone.usda@[^\n]*$"):
-        read_scene(tmp_path / "cloth.usda")
-    assert capfd.readouterr().err == ""
-
-
-def test_pins_may_stand_at_a_time_sample_alone(tmp_path):
+def test_a_missing_layer_elsewhere_is_a_warning_and_pins_may_stand_at_a_time_sample_alone(tmp_path, capfd):
     """The schema has an empty fallback for indices, which is not what the file says."""
-    path = tmp_path / "cloth.usda"
-    path.write_text(STAGE.replace("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [0, 1]}"))
-    assert read_scene(path).pins.vertices.tolist() == [0, 1]
+    text = STAGE.replace("indices = [0, 1]", "indices.timeSamples = {0: [0, 1], 2: [0, 1]}")
+    (tmp_path / "cloth.usda").write_text(text + 'def "Set" (references = @gone.usda@)\n{\n}\n')
+    with pytest.warns(UserWarning, match="^[^\n]*cloth.usda: In </Set>: Could not open asset @gone.usda@[^\n]*$"):
+        assert read_scene(tmp_path / "cloth.usda").pins.vertices.tolist() == [0, 1]
+    assert capfd.readouterr().err == ""
 
 
 def test_holes_are_no_cloth(tmp_path):
@@ -212,23 +157,16 @@ def run(n=5, solver=wc.Newton, output=None, **options):
     return wc.simulate(cloth, solver(**step), output, **options)
 
 
+OF_COPIES = "frames is 1,000,000,000 of 100 copies, which takes {} TB of memory; it must fit in the .* that are free"
 TOO_LARGE = [
     (lambda path: run(substeps=10**18), "substeps is 1000000000000000000; it must be 10,000,000 or less"),
     (lambda path: run(solver=wc.PBD, substeps=1, iterations=10**18), "iterations is 10+; it must be 10,000,000 or less"),
     (lambda path: run(dt=1e-308), "dt is 1e-308 s; at fps 60 a frame must be 10,000,000 steps or less"),
     (lambda path: run(dt=5e-324), "dt is 4.94066e-324 s; at fps 60 a frame must be"),
     (lambda path: run(frames=10**12), "frames is 10+; it must be 1,000,000,000 or less"),
-    (
-        lambda path: run(frames=10**9, copies=100),
-        "frames is 1,000,000,000 of 100 copies, which takes 120 TB of memory; it must fit in the .* that are free",
-    ),
-    *(
-        (
-            lambda path, options=options: run(frames=10**9, copies=100, **options),
-            "frames is 1,000,000,000 of 100 copies, which takes 60 TB of memory; it must fit in the .* that are free",
-        )
-        for options in ({"solver": wc.Explicit}, {"dtype": "float32"})
-    ),
+    (lambda path: run(frames=10**9, copies=100), OF_COPIES.format(120)),
+    (lambda path: run(frames=10**9, copies=100, solver=wc.Explicit), OF_COPIES.format(60)),
+    (lambda path: run(frames=10**9, copies=100, dtype="float32"), OF_COPIES.format(60)),
     (
         lambda path: run(300, output=path / "out.usdc", frames=10**9),
         r"frames is 1,000,000,000, which takes 2.16e\+03 TB of the disk of .*; it must fit in the .* that are free there",
@@ -251,11 +189,6 @@ def test_what_no_machine_takes(tmp_path, monkeypatch, make, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         make(tmp_path)
     assert not list(tmp_path.iterdir())
-
-
-def test_memory_is_known_where_the_tests_run():
-    assert limits.available_memory() > 10**8
-    assert limits.shown_bytes(999) == "999 bytes" and limits.shown_bytes(1.5e9) == "1.5 GB"
 
 
 # --- at the command line: one sentence, whatever the matter is
@@ -286,6 +219,11 @@ def test_broken_arrays(tmp_path, content, message, ending):
         wc.open_sequence(path, mesh=wc.Mesh.grid(2, 2))
 
 
+def test_memory_is_known_where_the_tests_run():
+    assert limits.available_memory() > 10**8
+    assert limits.shown_bytes(999) == "999 bytes" and limits.shown_bytes(1.5e9) == "1.5 GB"
+
+
 def test_gaps_without_end(tmp_path):
     """Of three frames some hundred million are missing, or the number of one is none that NumPy holds."""
     for name in ("cloth_0.obj", "cloth_1.obj", "cloth_900000000.obj"):
@@ -297,6 +235,10 @@ def test_gaps_without_end(tmp_path):
         wc.open_sequence(tmp_path)
 
 
+MOVE = "deform cloth.usda --move all --translate 0 0 1"
+NO_MEMORY = "there is not enough memory; a smaller mesh or picture, "
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -304,29 +246,17 @@ def test_gaps_without_end(tmp_path):
         (["run", os.fsdecode(b"\xff.usda")], "'\\\\udcff.usda': a path in USD must be UTF-8"),
         (["run", "hanging", "-o", "a\nb.usdc"], "a\\\\nb.usdc': a path in USD must be UTF-8"),
         (["run", "hanging", "-o", os.fsdecode(b"\xff.usdc")], "\\\\udcff.usdc': a path in USD must be UTF-8"),
-        (
-            ["run", "hanging", "-o", "o.usdc", "--frames", str(10**12)],
-            "frames is 1000000000000; it must be 1,000,000,000 or less",
-        ),
-        (
-            ["run", "hanging", "-o", "o.usdc", "-s", "dt=1e-308"],
-            "dt is 1e-308 s; at fps 60 a frame must be 10,000,000 steps or",
-        ),
-        (["run", "hanging", "-o", "o.usdc", "-s", f"substeps={10**18}"], "it must be 10,000,000 or less"),
-        (
-            ["deform", "cloth.usda", "--move", "all", "--translate", "0", "0", "1", "-o", "o.usdc", "--frames", "10000000000"],
-            "frames is 10000000000; it must be 10,000,000 or less",
-        ),
-        (["info", "utf8.usda"], "utf8.usda: it holds text that is no valid UTF-8"),
-        (["info", "huge.usda", "--dtype", "float32"], r"an edge of the mesh is 1e\+38 m long"),
-        (["info", "memory.py"], "memory.py, line 2: MemoryError"),
-        (
-            ["run", "later.py", "-o", "o.usdc"],
-            "there is not enough memory; a smaller mesh or picture, fewer copies or fewer frames take less: 16",
-        ),
-        (["run", "device.py", "-o", "o.usdc"], "there is not enough memory; a smaller mesh or picture, "),
-        (["run", "disk.py", "-o", "o.usdc"], "a file could not be read or written: No space left on device"),
-        (["run", "deep.py", "-o", "o.usdc"], "the input is nested too deeply to be read"),
+        (f"run hanging -o o.usdc --frames {10**12}", "frames is 1000000000000; it must be 1,000,000,000 or less"),
+        ("run hanging -o o.usdc -s dt=1e-308", "dt is 1e-308 s; at fps 60 a frame must be 10,000,000 steps or"),
+        (f"run hanging -o o.usdc -s substeps={10**18}", "it must be 10,000,000 or less"),
+        (f"{MOVE} -o o.usdc --frames {10**10}", "frames is 10000000000; it must be 10,000,000 or less"),
+        ("info utf8.usda", "utf8.usda: it holds text that is no valid UTF-8"),
+        ("info huge.usda --dtype float32", r"an edge of the mesh is 1e\+38 m long"),
+        ("info memory.py", "memory.py, line 2: MemoryError"),
+        ("run later.py -o o.usdc", f"{NO_MEMORY}fewer copies or fewer frames take less: 16"),
+        ("run device.py -o o.usdc", NO_MEMORY),
+        ("run disk.py -o o.usdc", "a file could not be read or written: No space left on device"),
+        ("run deep.py -o o.usdc", "the input is nested too deeply to be read"),
     ],
 )
 def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, line):
@@ -337,18 +267,14 @@ def test_one_line_at_the_command_line(tmp_path, monkeypatch, capfd, arguments, l
     (tmp_path / "utf8.usda").write_bytes(STAGE.encode().replace(b'"Spring"', b'"Spr\xff\xfeing"'))
     (tmp_path / "huge.usda").write_text(STAGE.replace("(1, 0, 0)", "(1e38, 0, 0)").replace("(0, 0, 1)", "(0, 0, -1e38)"))
     (tmp_path / "memory.py").write_text("def scene():\n    raise MemoryError\n")
-    raised = {
-        "later": "MemoryError('16 GiB')",
-        "device": "RuntimeError('Failed to allocate 3 bytes on device')",
-        "disk": "OSError(28, 'No space left on device')",
-        "deep": "RecursionError",
-    }
+    raised = {"later": "MemoryError('16 GiB')", "device": "RuntimeError('Failed to allocate 3 bytes on device')"}
+    raised |= {"disk": "OSError(28, 'No space left on device')", "deep": "RecursionError"}
     for name, error in raised.items():  # past what is said of a scene file, as in a step
         text = f"import warpcloth as wc\nclass Broken(wc.Scene):\n    def build(self, **_):\n        raise {error}\n"
         make = "def scene():\n    return Broken(wc.Mesh.grid(3, 3), density=1.0, terms=[wc.Spring(stiffness=1.0)])\n"
         (tmp_path / f"{name}.py").write_text(text + make)
     before = set(os.listdir(b"."))
-    assert main(arguments) == 2
+    assert main(arguments.split() if isinstance(arguments, str) else arguments) == 2
     out, err = capfd.readouterr()
     said = [each for each in err.splitlines() if not each.startswith("warpcloth: warning: ")]  # of the size of the cloth
     assert out == "" and len(said) == 1 and said[0].startswith("warpcloth: ") and re.search(line, said[0]), err
@@ -378,13 +304,9 @@ def test_a_full_disk_at_the_last_file_loses_nothing(tmp_path, ending):
     writer = AnimationWriter(tmp_path / f"out.{ending}", mesh, 24, chunk=5)
     for points in frames:
         writer.append(points, points)
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limit[1]))  # of about 30 kB a chunk
-    try:
-        with pytest.raises(OSError, match=rf"^{tmp_path}/out.{ending}: could not be written.*; frames 0 to 39 are ") as caught:
-            writer.close(single_file=True)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    message = rf"^{tmp_path}/out.{ending}: could not be written.*; frames 0 to 39 are "
+    with room_for(50_000), pytest.raises(OSError, match=message) as caught:  # of about 30 kB a chunk
+        writer.close(single_file=True)
     assert "\n" not in str(caught.value) and f"are in {writer.path}, " in str(caught.value)
     np.testing.assert_array_equal(FrameSequence(writer.path), frames)
 
@@ -407,12 +329,8 @@ def test_a_full_disk_is_said_with_the_name_of_the_file(tmp_path, monkeypatch, ca
     assert main([*command.split(), f"before.{name[2:]}"]) in (0, 1)  # compiles kernels, which need room too
     files = set(os.listdir())
     capfd.readouterr()
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40, limit[1]))
-    try:
+    with room_for(40):
         assert main([*command.split(), name]) == 2
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert capfd.readouterr().err == f"warpcloth: {name}: File too large\n" and set(os.listdir()) == files
 
 
@@ -473,32 +391,19 @@ def test_a_package_that_is_cut_is_not_taken_for_whole(tmp_path, monkeypatch, kep
 
 def test_a_package_holds_no_file_from_elsewhere(tmp_path):
     """Textures of the stage's folders are packed, of a referenced layer's too; a file from outside keeps its path."""
-    for name in (
-        "show/tex/a.png",
-        "show/tex/b.1001.png",
-        "show/tex/b.1002.png",
-        "library/set.usda",
-        "library/t.png",
-        "secret.txt",
-    ):
+    textures = ("show/tex/a.png", "show/tex/b.1001.png", "show/tex/b.1002.png", "library/t.png")
+    for name in (*textures, "library/set.usda", "secret.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     (tmp_path / "show/link.png").symlink_to(tmp_path / "secret.txt")
-    assets = {
-        "near": "@./tex/a.png@",
-        "tiles": "@./tex/b.<UDIM>.png@",
-        "above": "@../secret.txt@",
-        "root": "@/etc/hostname@",
-        "link": "@./link.png@",
-        "gone": "@./gone.png@",
-    }
-    given = "".join(f"    asset {name} = {path}\n" for name, path in assets.items())
+    assets = {"near": "./tex/a.png", "tiles": "./tex/b.<UDIM>.png", "above": "../secret.txt", "root": "/etc/hostname"}
+    assets |= {"link": "./link.png", "gone": "./gone.png"}
+    given = "".join(f"    asset {name} = @{path}@\n" for name, path in assets.items())
     given += "    asset[] several = [@./tex/a.png@, @../secret.txt@]\n"
     text = STAGE.replace("    uniform token orientation", given + "    uniform token orientation")
     (tmp_path / "show/cloth.usda").write_text(text + 'def "Set" (references = @../library/set.usda@)\n{\n}\n')
-    (tmp_path / "library/set.usda").write_text(
-        '#usda 1.0\n(\n    defaultPrim = "S"\n)\ndef "S"\n{\n    asset shown = @./t.png@\n}\n'
-    )
+    library = '#usda 1.0\n(\n    defaultPrim = "S"\n)\ndef "S"\n{\n    asset shown = @./t.png@\n}\n'
+    (tmp_path / "library/set.usda").write_text(library)
     scene = read_scene(tmp_path / "show/cloth.usda")
     with pytest.warns(UserWarning) as warned:
         wc.simulate(scene, wc.Newton(substeps=1), output=tmp_path / "out.usdz")
@@ -506,17 +411,10 @@ def test_a_package_holds_no_file_from_elsewhere(tmp_path):
     assert said == ["../secret.txt", "./link.png", "/etc/hostname", str(tmp_path / "show/gone.png")]
     with zipfile.ZipFile(tmp_path / "out.usdz") as archive:
         packed = {name.partition("/")[2]: archive.read(name).decode() for name in archive.namelist()[1:]}
-    assert packed == {
-        name.rpartition("/")[2]: name
-        for name in ("show/tex/a.png", "show/tex/b.1001.png", "show/tex/b.1002.png", "library/t.png")
-    }
+    assert packed == {name.rpartition("/")[2]: name for name in textures}
     stage = Usd.Stage.Open(str(tmp_path / "out.usdz"))
     found = {name: stage.GetPrimAtPath("/Cloth").GetAttribute(name).Get() for name in (*assets, "several")}
-    assert [found[name].path for name in ("above", "root", "link")] == [
-        "../secret.txt",
-        "/etc/hostname",
-        "./link.png",
-    ]
+    assert [found[name].path for name in ("above", "root", "link")] == ["../secret.txt", "/etc/hostname", "./link.png"]
     assert found["gone"] is None
     assert found["near"].resolvedPath.endswith("/a.png]") and found["tiles"].path.endswith("/b.<UDIM>.png")
     assert [asset.path.rpartition("/")[2] for asset in found["several"]] == ["a.png", "secret.txt"]
@@ -599,19 +497,12 @@ def test_all_threads_read_headers_parsed_once(tmp_path, kernel, monkeypatch):
 
 def test_a_full_cache_is_said(tmp_path, kernel):
     """LLVM would end the process, with the exit code of a run that diverged; once compiled a kernel needs no room."""
-    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limit[1]))
-    try:
-        with pytest.raises(OSError, match=r"File too large.*where Warp keeps compiled kernels .WARP_CACHE_PATH names another"):
-            kernel()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
-    kernel()
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limit[1]))
-    try:
+    message = r"File too large.*where Warp keeps compiled kernels .WARP_CACHE_PATH names another"
+    with room_for(10_000), pytest.raises(OSError, match=message):
         kernel()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    kernel()
+    with room_for(10_000):
+        kernel()
 
 
 @pytest.mark.parametrize("cache", ["full", pytest.param("file/cache", marks=pytest.mark.slow)])

@@ -10,30 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from support.stage_texts import prim
 from warpcloth.cli import main
 from warpcloth.run import scene_files
 from warpcloth.solvers import SOLVERS
 from warpcloth.usd import FrameSequence
 
 ROOT = Path(__file__).parents[2]
-MESH = """    def Mesh "{name}"
-    {{
-        int[] faceVertexCounts = [3, 3]
-        int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
-        point3f[] points = [({at}, 0, 0), ({to}, 0, 0), ({at}, 0, 1), ({to}, 0, 1)]
-        double warpcloth:density = 0.15
-        token warpcloth:terms:threads:type = "Spring"
-        double warpcloth:terms:threads:stiffness = 1000
-        token warpcloth:terms:threads:pairs = "edges"
-        double warpcloth:duration = 0.125
-    }}
-"""
-TWO = (
-    '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\ndef Xform "World"\n{\n'
-    + MESH.format(name="Left", at=0, to=1)
-    + MESH.format(name="Right", at=3, to=4)
-    + "}\n"
-)
+CLOTH = """int[] faceVertexCounts = [3, 3]
+int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
+double warpcloth:density = 0.15
+token warpcloth:terms:threads:type = "Spring"
+double warpcloth:terms:threads:stiffness = 1000
+token warpcloth:terms:threads:pairs = "edges"
+double warpcloth:duration = 0.125"""
+POINTS = [f"point3f[] points = [({x}, 0, 0), ({x + 1}, 0, 0), ({x}, 0, 1), ({x + 1}, 0, 1)]" for x in (0, 3)]
+SHEETS = [prim("Mesh", name, CLOTH, points) for name, points in zip(("Left", "Right"), POINTS, strict=True)]
+HEAD = '#usda 1.0\n(\n    defaultPrim = "World"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n'
+TWO = HEAD + prim("Xform", "World", *SHEETS)
 
 
 def listed(capfd, *argv):
@@ -68,12 +62,8 @@ def test_options_are_listed_from_the_record(name, capfd):
 
 def test_parameters_are_listed_of_a_known_scene_a_file_and_a_stage(tmp_path, capfd):
     assert listed(capfd, "run", "net", "-p", "help")["kind"]["allowed"] == "one of structural, shear, bending"
-    assert listed(capfd, "info", "hanging", "-p", "help")["n"] == {
-        "name": "n",
-        "default": 32,
-        "needed": False,
-        "allowed": "a whole number",
-    }
+    n = {"name": "n", "default": 32, "needed": False, "allowed": "a whole number"}
+    assert listed(capfd, "info", "hanging", "-p", "help")["n"] == n
     (tmp_path / "needs.py").write_text("def scene(n: int, flat: bool = False):\n    return n\n", encoding="utf-8")
     assert main(["run", str(tmp_path / "needs.py"), "-p", "help"]) == 0
     lines = [line.split() for line in capfd.readouterr().out.splitlines()]
@@ -155,11 +145,6 @@ def test_a_choice_is_made_for_the_pins_that_are_run(tmp_path, capfd, monkeypatch
     monkeypatch.setattr(choose, "choose", refuse)
     assert main(["run", "hanging", "-p", "n=3", "--pins", "z == 0", "--tolerance", "1%"]) == 2
     assert "seen" in capfd.readouterr().err and seen == [[0, 1, 2]]
-
-
-def test_the_package_is_a_command():
-    done = subprocess.run([sys.executable, "-m", "warpcloth", "--version"], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0 and done.stdout.startswith("warpcloth "), done.stderr
 
 
 COMPLETIONS = [

@@ -48,11 +48,8 @@ def test_neighbours_of_a_shuffled_grid_come_near(pattern):
     assert np.abs(np.diff(np.argsort(order)[mesh.edges], axis=1)).max() < 4 * n
     # Of two ranks at random |i − j| is n²/3 in the mean; two levels of 2n at most leave less.
     assert spread(mesh, order) < 2 * n < 0.9 * n * n / 3 < spread(mesh)
-
-
-def test_parts_that_do_not_hang_together_are_all_there():
-    mesh = wc.Mesh(np.random.default_rng(3).normal(size=(7, 3)), edges=[[6, 0], [2, 4]])
-    assert np.array_equal(np.sort(near_order(mesh)), np.arange(7))
+    apart = wc.Mesh(np.random.default_rng(3).normal(size=(7, 3)), edges=[[6, 0], [2, 4]])  # parts are all there
+    assert np.array_equal(np.sort(near_order(apart)), np.arange(7))
 
 
 @pytest.mark.parametrize(
@@ -88,49 +85,43 @@ SOLVERS = {
 }
 
 
+def moves_the_same(scene, solver, random, tolerance, **build):
+    """Checks the state after 6 frames, in the order of the scene."""
+    found = []
+    for order in (None, random.permutation(len(scene.mesh.points))):
+        stepper = solver.bind(scene.build(order=order, dtype="float64", **build))
+        for _ in range(6):
+            stepper.frame()
+        found.append([stepper.model.in_scene_order(array.numpy()) for array in stepper.state])
+    for as_declared, reordered in zip(*found, strict=True):
+        np.testing.assert_allclose(reordered, as_declared, rtol=0, atol=tolerance)
+
+
 @pytest.mark.parametrize("copies", slow_but([3], [1, 3]))
 @pytest.mark.parametrize("solver", slow_but(("newton", "pbd, averaged"), SOLVERS))
 def test_any_order_gives_the_same_motion(solver, copies, device):
-    """Of everything that a scene names by vertex or element, and that copies vary; the order need not be a good one.
-
-    float64 rounds by 1e-16, and iterations end at different roundings.
-    """
+    """Of everything that a scene names by vertex or element, and that copies vary; the order need not be a good one."""
     mesh = wc.Mesh.grid(6, 5, pattern="alternating")
     n, edges = len(mesh.points), len(mesh.edges)
     random = np.random.default_rng(5)
     positions = mesh.points * [1.01, 1.0, 1.02]
     keyframes = positions[[4, 0]] + 0.01 * np.arange(6)[:, None, None] * [1.0, 2.0, 0.0]
-    scene = wc.Scene(
-        mesh,
-        masses=random.uniform(1e-3, 2e-3, n),
-        positions=positions,
-        velocities=random.normal(scale=0.1, size=(n, 3)),
-        terms=[
-            wc.Spring(stiffness=random.uniform(50.0, 100.0, edges), rest_lengths=random.uniform(0.19, 0.21, edges)),
-            wc.QuadraticBending(stiffness=random.uniform(1e-4, 1e-3, len(mesh.hinges))),
-            wc.Attachment(vertices=[7, 29], targets=[[0.0, 0.5, 0.0], [1.0, 0.2, 1.0]], stiffness=[1.0, 2.0]),
-        ],
-        pins=wc.Pins([4, 0], keyframes),
-        duration=0.1,
-    )
-    vary = (
-        None
-        if copies == 1
-        else {
-            "masses": random.uniform(1e-3, 2e-3, (copies, n)),
-            "Spring.stiffness": random.uniform(50.0, 100.0, (copies, edges)),
-            "velocities": random.normal(scale=0.1, size=(copies, n, 3)),
-        }
-    )
-    build = {"device": device, "dtype": "float64", "copies": copies, "vary": vary}
-    found = []
-    for order in (None, random.permutation(n)):
-        stepper = SOLVERS[solver].bind(scene.build(order=order, **build))
-        for _ in range(6):
-            stepper.frame()
-        found.append([stepper.model.in_scene_order(array.numpy()) for array in stepper.state])
-    for as_declared, reordered in zip(*found, strict=True):
-        np.testing.assert_allclose(reordered, as_declared, rtol=0, atol=1e-9)
+    lengths = random.uniform(0.19, 0.21, edges)
+    terms = [
+        wc.Spring(stiffness=random.uniform(50.0, 100.0, edges), rest_lengths=lengths),
+        wc.QuadraticBending(stiffness=random.uniform(1e-4, 1e-3, len(mesh.hinges))),
+        wc.Attachment(vertices=[7, 29], targets=[[0.0, 0.5, 0.0], [1.0, 0.2, 1.0]], stiffness=[1.0, 2.0]),
+    ]
+    start = {
+        "positions": positions,
+        "velocities": random.normal(scale=0.1, size=(n, 3)),
+        "masses": random.uniform(1e-3, 2e-3, n),
+    }
+    scene = wc.Scene(mesh, terms=terms, pins=wc.Pins([4, 0], keyframes), duration=0.1, **start)
+    vary = {"masses": random.uniform(1e-3, 2e-3, (copies, n)), "Spring.stiffness": random.uniform(50.0, 100.0, (copies, edges))}
+    vary |= {"velocities": random.normal(scale=0.1, size=(copies, n, 3))}
+    build = {"device": device, "copies": copies, "vary": vary if copies > 1 else None}
+    moves_the_same(scene, SOLVERS[solver], random, 1e-9, **build)  # iterations end at different roundings, of 1e-16
 
 
 def test_bodies_move_the_same_in_any_order(device):
@@ -142,13 +133,7 @@ def test_bodies_move_the_same_in_any_order(device):
         terms=[wc.Spring(stiffness=50.0), wc.RigidCluster(vertices=[[0, 1, 7, 6], [29, 28, 22]], stiffness=1e3)],
         pins=[0],
     )
-    found = []
-    for order in (None, random.permutation(30)):
-        stepper = wc.Explicit(substeps=32).bind(scene.build(device=device, dtype="float64", order=order))
-        for _ in range(6):
-            stepper.frame()
-        found.append(stepper.model.in_scene_order(stepper.state.x.numpy()))
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-11)
+    moves_the_same(scene, wc.Explicit(substeps=32), random, 1e-11, device=device)
 
 
 def test_what_is_found_of_a_scene_is_the_same_in_any_order(device):
@@ -236,6 +221,15 @@ def test_a_deformation_is_the_same(weights, energy, monkeypatch, device):
         np.testing.assert_allclose(*(getattr(each, name) for each in found), rtol=0, atol=1e-10)
 
 
+@pytest.fixture
+def built(tmp_path, monkeypatch):
+    """The models that are built; the scene is in a file sheet.py."""
+    models, build = [], wc.Scene.build
+    monkeypatch.setattr(wc.Scene, "build", lambda scene, **options: models.append(build(scene, **options)) or models[-1])
+    (tmp_path / "sheet.py").write_text(SCENE)
+    return models
+
+
 SCENE = """
 import numpy as np
 import warpcloth as wc
@@ -248,11 +242,7 @@ def scene():
 """
 
 
-def test_the_command_renumbers_the_model_of_explicit_steps_that_it_chooses(tmp_path, always, capfd, monkeypatch):
-    built = []
-    build = wc.Scene.build
-    monkeypatch.setattr(wc.Scene, "build", lambda scene, **options: built.append(build(scene, **options)) or built[-1])
-    (tmp_path / "sheet.py").write_text(SCENE)
+def test_the_command_renumbers_the_model_of_explicit_steps_that_it_chooses(tmp_path, always, built, capfd, monkeypatch):
     output = tmp_path / "out.usdc"
     assert main(["run", str(tmp_path / "sheet.py"), "--solver", "explicit", "--json", "-o", str(output)]) == 0
     substeps = json.loads(capfd.readouterr().out)["options"]["substeps"]
@@ -265,11 +255,7 @@ def test_the_command_renumbers_the_model_of_explicit_steps_that_it_chooses(tmp_p
 
 
 @pytest.mark.parametrize("solver", ["explicit", "pbd"])
-def test_a_benchmark_measures_what_a_run_does(solver, tmp_path, always, device, monkeypatch):
-    built = []
-    build = wc.Scene.build
-    monkeypatch.setattr(wc.Scene, "build", lambda scene, **options: built.append(build(scene, **options)) or built[-1])
-    (tmp_path / "sheet.py").write_text(SCENE)
+def test_a_benchmark_measures_what_a_run_does(solver, tmp_path, always, built, device):
     scene, setup = asdict(SceneRef(str(tmp_path / "sheet.py"))), asdict(Setup(solver, {"substeps": 64}))
     row = measure(scene, setup, frames=0, device=device, dtype="float32", started=time.time())
     assert row["status"] == "ok"

@@ -18,11 +18,7 @@ GRID = wc.Mesh.grid(5, 4)
 
 
 def cut(mesh, labels):
-    """A mesh whose triangles share a vertex only with those of the same label (T,), as programs cut it by charts of a texture.
-
-    Returns:
-        Points, triangles, and the vertex of ``mesh`` of each point.
-    """
+    """Points, triangles and vertices of a mesh that is cut where labels (T,) of triangles differ, as by charts of a texture."""
     keys, which = np.unique(np.stack([np.repeat(labels, 3), mesh.triangles.ravel()], axis=1), axis=0, return_inverse=True)
     return mesh.points[keys[:, 1]], which.reshape(-1, 3), keys[:, 1]
 

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 import warpcloth as wc
+from support.mesh_texts import TEXTS
 from warpcloth.mesh.frame_names import frames_of_names
 from warpcloth.mesh.mesh import Mesh, Surface
 from warpcloth.mesh.sequences import as_sequence, open_sequence
-from warpcloth.scenes import chain, hanging
-from warpcloth.usd import AnimationWriter, FrameSequence, read_mesh
+from warpcloth.scenes import hanging
+from warpcloth.usd import FrameSequence, read_mesh
 
 EPS32, EPS = np.finfo(np.float32).eps, np.finfo(np.float64).eps
 FRAMES = 5
@@ -37,11 +38,7 @@ def frames(mesh=MESH, count=FRAMES):
 
 
 def cache(path, codes=(101, 102, 103, 104), rest=True, moving=True):
-    """Writes what another program may write: two quads in cm, z up, left-handed, under a group that turns and moves.
-
-    Returns:
-        Stage, prim, and the points of each frame in world space [m], (F, 6, 3).
-    """
+    """Two quads in cm, z up, left-handed, under a group that turns and moves: stage, prim, points in the world (F, 6, 3)."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     UsdGeom.SetStageUpAxis(stage, "Z")
@@ -211,44 +208,30 @@ def test_broken_frame_of_a_stage(tmp_path, name, value, message):
         sequence[2]
 
 
-def test_stages_that_are_refused(tmp_path):
-    stage, prim, _ = cache(tmp_path / "cache.usda")
-    with pytest.raises(ValueError, match=r"cache.usda, prim Shirt: there is no such prim"):
-        open_sequence(tmp_path / "cache.usda", prim="Shirt")
-    UsdGeom.Mesh(prim).GetPointsAttr().Set(Vt.Vec3fArray(9))
+@pytest.mark.parametrize(
+    ("prim", "kept", "rest", "message"),
+    [
+        ("Shirt", True, 6, "prim Shirt: there is no such prim"),
+        (None, True, 9, "prim /Rig/Sheet: 6 points at time code 101, must be 9 as at rest"),
+        (None, False, 6, "prim /Rig/Sheet: points have no time samples.*not animated"),
+    ],
+)
+def test_stages_that_are_refused(tmp_path, prim, kept, rest, message):
+    stage, sheet, _ = cache(tmp_path / "cache.usda")
+    if not kept:
+        sheet.GetAttribute("points").Clear()
+    sheet.GetAttribute("points").Set(Vt.Vec3fArray(rest))
     stage.Save()
-    with pytest.raises(ValueError, match=r"cache.usda, prim /Rig/Sheet: 6 points at time code 101, must be 9 as at rest"):
-        open_sequence(tmp_path / "cache.usda")
-    prim.GetAttribute("points").Clear()
-    prim.GetAttribute("points").Set(Vt.Vec3fArray(6))
-    stage.Save()
-    with pytest.raises(ValueError, match=r"cache.usda, prim /Rig/Sheet: points have no time samples.*not animated"):
-        open_sequence(tmp_path / "cache.usda")
-    with pytest.raises(FileNotFoundError, match=r"none\.usdc: there is no such file"):
-        open_sequence(tmp_path / "none.usdc")
-    links = chain.scene().mesh
-    with AnimationWriter(tmp_path / "chain.usda", links, 24) as writer:
-        writer.append(links.points, 0 * links.points)
-    with pytest.raises(ValueError, match=r"chain.usda: has edges and no triangles"):
-        open_sequence(tmp_path / "chain.usda")
+    with pytest.raises(ValueError, match=f"cache.usda, {message}"):
+        open_sequence(tmp_path / "cache.usda", prim=prim)
 
 
 # ---------------------------------------------------------------------------------------------------------- files
 
 
 def export(path, points, triangles=MESH.triangles):
-    """Writes a text file whose numbers are exact."""
-    points = [" ".join(map(repr, point)) for point in np.asarray(points, dtype=np.float64).tolist()]
-    if path.suffix.lower() == ".obj":
-        lines = [f"v {point}" for point in points] + ["f " + " ".join(str(i + 1) for i in row) for row in triangles]
-    else:
-        faces = [f"{len(row)} " + " ".join(map(str, row)) for row in triangles]
-        head = ["OFF", f"{len(points)} {len(faces)} 0"]
-        if path.suffix.lower() == ".ply":
-            head = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property double {x}" for x in "xyz")]
-            head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-        lines = head + points + faces
-    path.write_text("\n".join(lines) + "\n")
+    text = TEXTS.get(path.suffix.lower()[1:], TEXTS["off"])
+    path.write_text(text(points, np.asarray(triangles).tolist()))
 
 
 def folder(path, names, ending="obj"):
@@ -328,41 +311,34 @@ def test_numbers_in_names_come_back_in_order_or_are_refused(ticks, pattern, digi
         assert [*found.items()] == sorted(files.items())
 
 
-def test_a_pattern_chooses(tmp_path):
+def test_a_pattern_or_a_name_chooses(tmp_path):
     folder(tmp_path / "a", ["shirt_1", "shirt_2", "trousers_1"])
     assert len(open_sequence(str(tmp_path / "?" / "shirt_*"), fps=24)) == 2
     folder(tmp_path / "[a]", ["1", "2"])  # a folder that looks like a pattern
     assert len(open_sequence(tmp_path / "[a]", fps=24)) == 2
-
-
-def test_one_of_several_objects(tmp_path):
     for frame in range(3):
-        export(tmp_path / f"{frame}.obj", motion(MESH, frame))
-        cloth = (tmp_path / f"{frame}.obj").read_text()
-        (tmp_path / f"{frame}.obj").write_text(f"o shirt\n{cloth}o ball\nv 0 0 {frame}\nv 1 0 0\nv 0 1 0\nf 10 11 12\n")
+        ball = f"o ball\nv 0 0 {frame}\nv 1 0 0\nv 0 1 0\nf 10 11 12\n"
+        (tmp_path / f"{frame}.obj").write_text(f"o shirt\n{TEXTS['obj'](motion(MESH, frame), MESH.triangles.tolist())}{ball}")
     assert open_sequence(tmp_path, "shirt", 24)[2].shape == (9, 3)
     assert open_sequence(tmp_path, "ball", 24)[2][0, 2] == 2.0
     with pytest.raises(ValueError, match=r"0.obj: has several geometries, name one of them: 'ball', 'shirt'"):
         open_sequence(tmp_path, fps=24)
 
 
-def other_triangle(path):
-    export(path, MESH.points, [*MESH.triangles[:5].tolist(), (4, 8, 7), *MESH.triangles[6:].tolist()])
-
-
-BROKEN_FILES = [  # what frame 3 is, message
-    (lambda path: export(path, MESH.points[:8], MESH.triangles[:1]), "8 vertices, must be 9 as in .*cloth_1.obj"),
-    (lambda path: export(path, MESH.points, MESH.triangles[:-1]), "7 faces, must be 8 as in .*cloth_1.obj"),
-    (other_triangle, r"face 5 has vertices \[4, 8, 7\], must be \[.*\] as in .*cloth_1.obj"),
-    (lambda path: path.write_text(""), "the file is empty"),
-    (lambda path: path.write_text("v 0 0 0\n"), "has no triangles"),
+ROWS = MESH.triangles.tolist()
+BROKEN_FILES = [  # text of frame 3, message
+    (TEXTS["obj"](MESH.points[:8], ROWS[:1]), "8 vertices, must be 9 as in .*cloth_1.obj"),
+    (TEXTS["obj"](MESH.points, ROWS[:-1]), "7 faces, must be 8 as in .*cloth_1.obj"),
+    (TEXTS["obj"](MESH.points, [*ROWS[:5], (4, 8, 7), *ROWS[6:]]), r"face 5 has vertices \[4, 8, 7\], must be \[.*\] as in "),
+    ("", "the file is empty"),
+    ("v 0 0 0\n", "has no triangles"),
 ]
 
 
-@pytest.mark.parametrize(("damage", "message"), BROKEN_FILES, ids=["vertices", "count", "triangle", "empty", "cloud"])
-def test_broken_file(tmp_path, damage, message):
+@pytest.mark.parametrize(("text", "message"), BROKEN_FILES, ids=["vertices", "count", "triangle", "empty", "cloud"])
+def test_broken_file(tmp_path, text, message):
     where = folder(tmp_path / "frames", ["cloth_1", "cloth_2", "cloth_3", "cloth_4"])
-    damage(where / "cloth_3.obj")
+    (where / "cloth_3.obj").write_text(text)
     sequence = open_sequence(where, fps=24)
     np.testing.assert_array_equal(sequence[3], motion(MESH, 3))
     with pytest.raises(ValueError, match=f"^{re.escape(str(where / 'cloth_3.obj'))}: {message}"):
@@ -389,6 +365,7 @@ REFUSED_FOLDERS = [  # names of files, what is opened, fps, kind of error, messa
     (["1.obj"], "1.obj", 24, ValueError, r'1.obj: is one mesh; it must be a folder of them, or a pattern such as ".*/\*.obj"'),
     (["1.ply"], "1.ply", 24, ValueError, r'1.ply: is one mesh; .* or a pattern such as ".*/\*.ply"'),
     (["1.mtl"], "1.mtl", 24, ValueError, "1.mtl: must be a folder or pattern of mesh files, or end with .usd .* .npz .npy"),
+    (["1.obj"], "none.usdc", 24, FileNotFoundError, "none.usdc: there is no such file"),
     (["1.obj"], "elsewhere", 24, FileNotFoundError, "elsewhere: no such file or folder"),
 ]
 
@@ -448,12 +425,7 @@ REFUSED_ARRAYS = [  # ending, what is written, fps, message
     ("npz", {"points": frames()[0], "triangles": MESH.triangles}, 24, r"points has shape \(9, 3\); it must be \(frames, vert"),
     ("npz", {"points": frames()[:, :8], "triangles": MESH.triangles}, 24, "must be indices of the 8 points"),
     ("npz", {"points": frames(), "triangles": MESH.triangles, "times": [0, 1]}, None, r"times has shape \(2,\); .* \(5,\)"),
-    (
-        "npz",
-        {"points": frames(), "triangles": MESH.triangles, "times": [0, 1, 1, 2, 3]},
-        None,
-        r"times\[2\] is 1.0; it must be la",
-    ),
+    ("npz", {"points": frames(), "triangles": MESH.triangles, "times": [0, 1, 1, 2, 3]}, None, r"times\[2\] is 1.0; it must "),
     ("npz", {"points": np.array(["x"]), "triangles": MESH.triangles}, 24, "points.npy has type <U1, must be real numbers"),
     ("npz", b"no archive", 24, "is no .npz file, as np.savez writes it"),
     ("npy", b"no array", 24, "is no .npy file, as np.save writes it"),
@@ -476,19 +448,20 @@ def test_array_files_that_are_refused(tmp_path, ending, content, fps, message):
         open_sequence(path, fps=fps, mesh=MESH)
 
 
-def test_array_files_that_need_more(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("a.npy", {}, "has no triangles; give a rest mesh .* 'warpcloth convert a.npy a.npz --rest MESH'"),
+        ("a.npy", {"prim": "Sheet", "mesh": MESH}, "prim is 'Sheet', and arrays have no prims; leave it out"),
+        ("a.npy", {"fps": 1e-100, "mesh": MESH}, r"times are from 0 to 4e\+100 s; they must be within 1e\+15 s"),
+        ("a.npz", {}, "points.npy is compressed, .*; write it by np.savez"),
+    ],
+)
+def test_array_files_that_need_more(tmp_path, name, options, message):
     np.save(tmp_path / "a.npy", frames())
-    with pytest.raises(
-        ValueError, match=r"a.npy: has no triangles; give a rest mesh .* 'warpcloth convert a.npy a.npz --rest MESH'"
-    ):
-        open_sequence(tmp_path / "a.npy", fps=24)
-    with pytest.raises(ValueError, match=r"a.npy: prim is 'Sheet', and arrays have no prims; leave it out"):
-        open_sequence(tmp_path / "a.npy", "Sheet", fps=24, mesh=MESH)
-    with pytest.raises(ValueError, match=r"a.npy: times are from 0 to 4e\+100 s; they must be within 1e\+15 s"):
-        open_sequence(tmp_path / "a.npy", fps=1e-100, mesh=MESH)
     np.savez_compressed(tmp_path / "a.npz", points=frames(), triangles=MESH.triangles)
-    with pytest.raises(ValueError, match=r"a.npz: points.npy is compressed, .*; write it by np.savez"):
-        open_sequence(tmp_path / "a.npz", fps=24)
+    with pytest.raises(ValueError, match=f"{name}: {message}"):
+        open_sequence(tmp_path / name, **({"fps": 24} | options))
 
 
 @pytest.mark.parametrize(
@@ -514,13 +487,11 @@ def test_what_python_holds(held):
             sequence[wrong]
 
 
-def test_the_coarsest_numbers_say_how_frames_are_rounded():
+def test_frames_without_times_and_of_several_types(tmp_path):
+    """The coarsest numbers say how frames are rounded."""
     one = frames()[0]
     for kinds, precision in (((np.float64, np.float32), np.float32), ((np.float64, np.int64), np.float64)):
         assert as_sequence(MESH, [one.astype(kind) for kind in kinds]).precision is precision
-
-
-def test_frames_without_times(tmp_path):
     assert as_sequence(MESH, frames()).times is None
     np.save(tmp_path / "f.npy", frames())
     assert open_sequence(tmp_path / "f.npy", mesh=MESH).times is None
@@ -555,6 +526,18 @@ def test_what_python_holds_and_is_refused(mesh, held, options, message):
         as_sequence(mesh, held, **options)
 
 
+@pytest.mark.parametrize(
+    ("axes", "corners", "message"),
+    [
+        (3, (0, 1, 9), r"triangles\[0\] is \[0, 1, 9\]; it must be indices of the 9"),
+        (2, (0, 1, 2), r"points: has shape \(9, 2\)"),
+    ],
+)
+def test_surface_still_refuses_what_is_no_mesh(axes, corners, message):
+    with pytest.raises(ValueError, match=message):
+        Surface(MESH.points[:, :axes], [corners])
+
+
 # ---------------------------------------------------------------------------------------------------------- flaws
 
 
@@ -569,14 +552,9 @@ def test_points_that_are_not_finite_are_as_they_are(tmp_path, kind, frame):
         np.savez(tmp_path / "a.npz", points=points, triangles=MESH.triangles)
         sequence = open_sequence(tmp_path / "a.npz", fps=24)
     elif kind == "usda":
-        stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
-        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-        sheet = UsdGeom.Mesh.Define(stage, "/Sheet")
-        sheet.CreateFaceVertexCountsAttr([3] * len(MESH.triangles))
-        sheet.CreateFaceVertexIndicesAttr(np.array(MESH.triangles).reshape(-1))
-        for code, now in enumerate(points):
-            sheet.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(now.astype(np.float32)), code)
-        stage.Save()
+        samples = {code: [*map(tuple, now.tolist())] for code, now in enumerate(points)}
+        text = re.sub(r"points = .*", f"points.timeSamples = {samples}", TEXTS["usda"](MESH.points, MESH.triangles.tolist()))
+        (tmp_path / "a.usda").write_text(text)
         sequence = open_sequence(tmp_path / "a.usda")
     else:
         for number, now in enumerate(points):
@@ -588,29 +566,16 @@ def test_points_that_are_not_finite_are_as_they_are(tmp_path, kind, frame):
         assert sequence.mesh.degenerate.tolist() == (around if frame == 0 else [])
 
 
-def flawed():
-    """A square of two triangles with some that are none beside it."""
-    points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1), (2, 0, 0), (0.5, 1e-9, 0)]
-    return points, [(0, 2, 3), (0, 1, 4), (0, 3, 1), (2, 2, 3), (0, 1, 5), (3, 3, 3)]
-
-
 @pytest.mark.parametrize("kind", ["arrays", "obj", "usda"])
 def test_surface_has_what_a_mesh_refuses(tmp_path, kind):
-    points, triangles = flawed()
+    """A square of two triangles with some that are none beside it."""
+    points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1), (2, 0, 0), (0.5, 1e-9, 0)]
+    triangles = [(0, 2, 3), (0, 1, 4), (0, 3, 1), (2, 2, 3), (0, 1, 5), (3, 3, 3)]
     if kind == "arrays":
         surface, mesh = Surface(points, triangles), lambda: Mesh(points, triangles)
     else:
         path = tmp_path / f"flawed.{kind}"
-        if kind == "obj":
-            export(path, points, triangles)
-        else:
-            stage = Usd.Stage.CreateNew(str(path))
-            UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-            sheet = UsdGeom.Mesh.Define(stage, "/Sheet")
-            sheet.CreatePointsAttr(points)
-            sheet.CreateFaceVertexCountsAttr([3] * len(triangles))
-            sheet.CreateFaceVertexIndicesAttr(np.array(triangles).reshape(-1))
-            stage.Save()
+        export(path, points, triangles)
         surface, mesh = Surface.load(path), lambda: Mesh.load(path)
     assert isinstance(surface, Surface) and repr(surface).startswith("Surface(6 points, 6 triangles")
     assert surface.degenerate.tolist() == [1, 3, 4, 5] and surface.degenerate.dtype == np.int32
@@ -619,10 +584,3 @@ def test_surface_has_what_a_mesh_refuses(tmp_path, kind):
     with pytest.raises(ValueError, match=r"triangles\[3\] is \[2, 2, 3\]; it must be 3 different vertices"):
         mesh()
     assert len(Surface(MESH.points, MESH.triangles).degenerate) == 0
-
-
-def test_surface_still_refuses_what_is_no_mesh():
-    with pytest.raises(ValueError, match=r"triangles\[0\] is \[0, 1, 9\]; it must be indices of the 9 points"):
-        Surface(MESH.points, [(0, 1, 9)])
-    with pytest.raises(ValueError, match=r"points: has shape \(9, 2\)"):
-        Surface(MESH.points[:, :2], [(0, 1, 2)])

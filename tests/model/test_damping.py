@@ -239,17 +239,10 @@ def test_a_hinge_is_damped_through_folded_flat(integrator, device):
 def oscillator(damping, omega=2.0, h=0.1):
     """A unit mass on a damped spring of rest length 1 from a pin, stretched by 0.25: u″ = −ω²u − βu′."""
     mesh = wc.Mesh(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), edges=[[0, 1]])
-    return wc.Scene(
-        mesh,
-        masses=[1.0, 1.0],
-        positions=[[0.0, 0.0, 0.0], [1.25, 0.0, 0.0]],
-        velocities=[[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]],
-        terms=[wc.Spring(stiffness=omega**2, damping=damping)],
-        pins=[0],
-        gravity=(0.0, 0.0, 0.0),
-        fps=1.0 / h,
-        duration=h,
-    )
+    given = {"masses": [1.0, 1.0], "positions": [[0.0, 0.0, 0.0], [1.25, 0.0, 0.0]]}
+    given |= {"velocities": [[0.0, 0.0, 0.0], [0.5, 0.0, 0.0]], "terms": [wc.Spring(stiffness=omega**2, damping=damping)]}
+    given |= {"pins": [0], "gravity": (0.0, 0.0, 0.0), "fps": 1.0 / h, "duration": h}
+    return wc.Scene(mesh, **given)
 
 
 def implicit(integrator):
@@ -360,10 +353,8 @@ def test_momentum_is_kept(name, solver, device):
 
 @pytest.mark.parametrize("solver", [wc.Explicit(substeps=1), wc.Newton(substeps=1, tolerance=1e-12, integrator="midpoint")])
 def test_a_spinning_body_goes_on(solver, device):
-    """Two masses that turn, held in balance by a spring: angular momentum as without damping, up to h² over the time.
-
-    The rate of a length that stays is of order h, and so is the moment of its force, taken at x + h v; midpoint keeps all.
-    """
+    """Two masses that turn, held in balance by a spring: angular momentum as without damping, up to h² over the time."""
+    # The rate of a length that stays is of order h, and so is the moment of its force, taken at x + h v; midpoint keeps all.
     changes = []
     for h in (4e-3, 2e-3):
         length, omega, k = 1.0, 2.0, 100.0
@@ -422,20 +413,12 @@ def test_it_calms_a_cloth(solver, device):
 
 @pytest.mark.parametrize("integrator", slow_but(["midpoint"], ["euler", "midpoint", "bdf2"]))
 def test_damped_steps_meet_at_one_minimiser(integrator, device):
-    """Newton, projective dynamics, ADMM and XPBD on springs, quadratic bending and attachments, all damped: 1e-8 m.
-
-    ADMM without bending: ½(‖y‖ − s̄)² of a y near 0 is concave around it, and there it need not converge.
-    """
+    """Newton, projective dynamics, ADMM and XPBD on springs, quadratic bending and attachments, all damped: 1e-8 m."""
+    # ADMM without bending: ½(‖y‖ − s̄)² of a y near 0 is concave around it, and there it need not converge.
     mesh = wc.Mesh.grid(5, 5, pattern="alternating")
-    scene = wc.Scene(
-        mesh,
-        density=1.0,
-        positions=1.02 * mesh.points,
-        velocities=0.3 * np.random.default_rng(0).normal(size=(25, 3)),
-        terms=[DAMPED["Spring"], DAMPED["Attachment"], DAMPED["QuadraticBending"]],
-        pins="corners",
-        fps=120.0,
-    )
+    given = {"density": 1.0, "positions": 1.02 * mesh.points, "velocities": 0.3 * np.random.default_rng(0).normal(size=(25, 3))}
+    given |= {"terms": [DAMPED["Spring"], DAMPED["Attachment"], DAMPED["QuadraticBending"]], "pins": "corners", "fps": 120.0}
+    scene = wc.Scene(mesh, **given)
 
     def end(solver, count):
         changes = {"iterations": 5000, **({} if isinstance(solver, wc.XPBD) else {"tolerance": 1e-11})}

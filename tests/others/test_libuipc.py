@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.others import BENDING, MASSES, MESH, SPRINGS, declared
 from warpcloth.cli import options
 from warpcloth.others.runs import run_other
 from warpcloth.others.simulators import SIMULATORS, shown_name
@@ -15,47 +16,12 @@ from warpcloth.others.uipc_model import engine, refuse_inexpressible, uipc_scene
 from warpcloth.others.uipc_runs import LibUipc
 from warpcloth.scenes import drape
 
-SPRINGS = wc.Spring(pairs=("structural", "shear"), stiffness=300.0)
-BENDING = wc.QuadraticBending(stiffness=1e-2)
 MEMBRANE = wc.NeoHookeanMembrane(stiffness=300.0, poisson_ratio=0.3)
-MESH = wc.Mesh.grid(4, 4, pattern="alternating")
-MASSES = np.linspace(0.1, 0.2, 16)
 FLOOR = wc.Plane(position=(0.0, -5.0, 0.0), friction=0.2)
 BALL = wc.Sphere(radius=0.5, position=(0.0, -3.0, 0.0), friction=0.1)
 RAMP = wc.Capsule(radius=0.1, length=2.0, axis=(1.0, 0.0, 0.0), position=(0.0, -3.0, 4.0))
 CARD = wc.MeshCollider([[0, -3, 0], [1, -3, 0], [0, -3, 1]], [[0, 1, 2]], position=(5.0, 0.0, 0.0))
 CONTACT = wc.Contact(distance=2e-3, stiffness=3e3)
-
-
-def declared(**fields):
-    return wc.Scene(MESH, **({"masses": MASSES, "terms": [SPRINGS, BENDING], "pins": [0, 3], "duration": 0.5} | fields))
-
-
-def moved(collider):
-    return replace(collider, position=[(0.0, -5.0, 0.0), (0.0, -4.0, 0.0)])
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"pins": wc.Pins([0, 3], axes="y")}, "along some axes"),
-        ({"pins": wc.Pins([0], keyframes=[MESH.points[[0]], MESH.points[[0]] + 0.1])}, "keyframes"),
-        ({"loads": wc.Pressure(vertices=np.arange(16), pressure=1.0)}, "loads"),
-        ({"air": wc.Air()}, "air"),
-        ({"colliders": [moved(BALL)]}, "moving colliders in this comparison, as Sphere is"),
-        (
-            {"colliders": [replace(FLOOR, friction=0.0)], "contact": wc.Contact(stiffness=np.inf)},
-            "infinite stiffness of contact",
-        ),
-        ({"colliders": [FLOOR], "contact": CONTACT, "self_contact": wc.SelfContact(distance=5e-3)}, "more than twice"),
-        ({"terms": [wc.CorotatedMembrane(stiffness=1.0)]}, "does not take CorotatedMembrane"),
-        ({"terms": [replace(SPRINGS, damping=1.0)]}, "damping with warpcloth's law, as that of Spring"),
-        ({"terms": [replace(SPRINGS, stiffness=np.inf)]}, "infinite stiffness, as that of Spring"),
-    ],
-)
-def test_inexpressible_scenes_are_refused(fields, words):
-    with pytest.raises(ValueError, match=words):
-        refuse_inexpressible(declared(**fields))
 
 
 def test_meshes_that_are_not_those_of_its_bending_are_refused():

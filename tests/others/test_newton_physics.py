@@ -9,6 +9,8 @@ import pytest
 import warp as wp
 
 import warpcloth as wc
+from support.others import MESH, SPRINGS
+from support.others import declared as net
 from warpcloth.chart.pareto import plot_time
 from warpcloth.cli import options
 from warpcloth.lab import trajectory
@@ -18,7 +20,7 @@ from warpcloth.lab.measurements import SceneRef, Setup
 from warpcloth.lab.own_reference import of_own, own_facts, own_reference, words_of_own
 from warpcloth.lab.work_precision import time_diagram, write_csv
 from warpcloth.others.newton_calibration import calibrate
-from warpcloth.others.newton_model import METHODS, TAKES, newton_model, refuse_inexpressible
+from warpcloth.others.newton_model import METHODS, TAKES, newton_model
 from warpcloth.others.newton_runs import NewtonPhysics
 from warpcloth.others.runs import run_other
 from warpcloth.others.simulators import SIMULATORS
@@ -26,8 +28,6 @@ from warpcloth.scenes import fold
 
 newton = pytest.importorskip("newton", reason="Newton is not installed: pip install -e '.[newton]'")
 
-SPRINGS = wc.Spring(pairs=("structural", "shear"), stiffness=300.0)
-MESH = wc.Mesh.grid(4, 4, pattern="alternating")
 TETRAHEDRON = wc.MeshCollider([[0, -3, 0], [1, -3, 0], [0, -2, 0], [0, -3, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 FLOOR = wc.Plane(position=(0.0, -5.0, 0.0))
 COLLIDERS = [
@@ -40,8 +40,7 @@ COLLIDERS = [
 
 
 def declared(**fields):
-    given = {"masses": np.linspace(0.1, 0.2, 16), "terms": [SPRINGS], "pins": [0, 3], "duration": 0.5}
-    return wc.Scene(MESH, **(given | fields))
+    return net(**({"terms": [SPRINGS]} | fields))
 
 
 def float32(values):
@@ -58,13 +57,8 @@ def test_arrays_are_those_of_the_scene_to_the_bit(method):
     terms = [replace(springs, damping=None) if method == "style3d" else longer, wc.QuadraticBending(stiffness=1e-3)]
     scene = declared(positions=positions, velocities=velocities, terms=terms, gravity=(1.0, -2.0, 3.0), colliders=COLLIDERS)
     model = newton_model(scene, method)
-    expected = {
-        "particle_q": positions,
-        "particle_qd": velocities,
-        "particle_mass": scene.vertex_masses,
-        "particle_radius": np.full(16, scene.contact.distance),
-        "gravity": scene.gravity[None],
-    }
+    expected = {"particle_q": positions, "particle_qd": velocities, "particle_mass": scene.vertex_masses}
+    expected |= {"particle_radius": np.full(16, scene.contact.distance), "gravity": scene.gravity[None]}
     if method == "style3d":
         expected["tri_indices"] = MESH.triangles
         assert model.spring_count == 0
@@ -155,33 +149,6 @@ def test_a_run_that_diverges_ends_before_that_frame(device):
     )
     assert not found.status.ok and len(found.points) == found.status.frame + 1 < 31
     assert "diverged in frame" in found.status.message and np.isfinite(found.points).all()
-
-
-MOVED = wc.Sphere(radius=0.1, position=[(0.0, -3.0, 0.0), (0.0, -2.0, 0.0)], name="ball")
-START = MESH.points[[0, 3]]
-REFUSED = [
-    ("vbd", {"pins": wc.Pins([0, 3], axes="y")}, "along some axes"),
-    ("vbd", {"pins": wc.Pins([0, 3], keyframes=[START, START + 0.1])}, "keyframes"),
-    ("vbd", {"loads": wc.Pressure(vertices=np.arange(16), pressure=1.0)}, "loads"),
-    ("vbd", {"air": wc.Air()}, "air"),
-    ("xpbd", {"self_contact": wc.SelfContact()}, "self-contact"),
-    ("vbd", {"colliders": [MOVED]}, "moving colliders.*ball"),
-    ("vbd", {"colliders": [FLOOR, wc.Plane(position=(0, -6, 0), friction=0.1, name="rug")]}, "friction.*rug"),
-    ("vbd", {"terms": [wc.StVKMembrane(stiffness=1.0)]}, "does not take StVKMembrane"),
-    ("xpbd", {"terms": [wc.NeoHookeanMembrane(stiffness=1.0)]}, "does not take NeoHookeanMembrane"),
-    ("vbd", {"terms": [wc.Spring(stiffness=np.inf)]}, "infinite stiffness.*Spring"),
-    ("xpbd", {"terms": [SPRINGS, wc.QuadraticBending(stiffness=1.0, damping=1.0)]}, "damping.*QuadraticBending"),
-    ("style3d", {"terms": [wc.Spring(stiffness=1.0, damping=1.0)]}, "damping.*Spring"),
-    ("style3d", {"terms": [wc.Spring(stiffness=1.0, rest_lengths=0.1)]}, "rest lengths.*Spring"),
-    ("style3d", {"terms": [wc.QuadraticBending(stiffness=1.0)]}, "springs or membranes"),
-    ("mpm", {}, "method is 'mpm'"),
-]
-
-
-@pytest.mark.parametrize(("method", "fields", "words"), REFUSED, ids=[words for _, _, words in REFUSED])
-def test_inexpressible_scenes_are_refused(method, fields, words):
-    with pytest.raises(ValueError, match=words):
-        refuse_inexpressible(declared(**fields), method)
 
 
 def test_hinges_between_different_triangles_are_refused():

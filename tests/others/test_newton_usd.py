@@ -129,11 +129,8 @@ def test_a_stage_for_newton_is_the_same_cloth_here(tmp_path, material, angles):
     path = tmp_path / "by_hand.usda"
     mesh = wc.Mesh.grid(4, 4, pattern="alternating")
     points = mesh.points + np.outer(np.sin(3.0 * mesh.points[:, 0]) * 0.1, [0.0, 1.0, 0.0])
-    texts = {
-        "counts": [3] * len(mesh.triangles),
-        "indices": mesh.triangles.ravel().tolist(),
-        "points": "[" + ", ".join(str(tuple(each)) for each in points.astype(np.float32).tolist()) + "]",
-    }
+    texts = {"counts": [3] * len(mesh.triangles), "indices": mesh.triangles.ravel().tolist()}
+    texts |= {"points": "[" + ", ".join(str(tuple(each)) for each in points.astype(np.float32).tolist()) + "]"}
     path.write_text(BY_HAND.format(material=material, angles=angles, **texts))
     model, scene = imported(path), read_scene(path, law="newton")
     assert scene.pins.vertices.tolist() == [0] == model.attachment_particle_body_particle.numpy().tolist()

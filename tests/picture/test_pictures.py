@@ -99,13 +99,8 @@ def test_a_legend_is_plain_and_survives_a_stage(scale, tmp_path):
 
     legend = scale.legend("stretch_1", "1")
     assert json.loads(json.dumps(legend, allow_nan=False)) == legend
-    assert [legend[key] for key in ("measure", "unit", "map", "low", "high")] == [
-        "stretch_1",
-        "1",
-        scale.map,
-        scale.low,
-        scale.high,
-    ]
+    expected = {"measure": "stretch_1", "unit": "1", "map": scale.map, "low": scale.low, "high": scale.high}
+    assert {key: legend[key] for key in expected} == expected
     assert legend.get("neutral") == scale.neutral
     stops = [legend[f"stop_{k}"] for k in range(9)]
     assert [stops[0]["value"], stops[-1]["value"]] == [scale.low, scale.high] and "stop_9" not in legend
@@ -296,11 +291,14 @@ def test_what_has_no_meaning_is_refused(make, message):
         make()
 
 
-def test_a_folder_that_does_not_exist_is_refused(tmp_path):
+def test_a_folder_that_does_not_exist_or_is_in_the_way_is_refused(tmp_path):
     path = tmp_path / "no" / "a.png"
     for write in (lambda: plot_percentiles(path, summaries(GROWING)), lambda: draw(path, None, None, None, None)):
         with pytest.raises(FileNotFoundError, match=r"a\.png: the folder .*no does not exist"):
             write()
+    (tmp_path / "a.png").mkdir()
+    with pytest.raises(ValueError, match=r"a\.png: is no regular file; it must be one, or free"):
+        check_path(tmp_path / "a.png", PICTURES)
 
 
 def test_a_picture_that_cannot_be_finished_leaves_the_earlier_one(tmp_path, monkeypatch):
@@ -410,9 +408,3 @@ def test_each_scalar_has_a_panel_and_neutral_values_a_line(tmp_path):
     plot_percentiles(tmp_path / "near.png", rows[4:8], neutrals={"scalar_1": 2.5})
     blue = [(np.ptp(imread(tmp_path / name)[..., :3], axis=-1) > 0.3).sum() for name in ("far.png", "near.png")]
     assert blue[0] == pytest.approx(blue[1], rel=0.2), "a line beyond all values is shown too"
-
-
-def test_a_folder_is_refused_before_anything_is_measured(tmp_path):
-    (tmp_path / "a.png").mkdir()
-    with pytest.raises(ValueError, match=r"a\.png: is no regular file; it must be one, or free"):
-        check_path(tmp_path / "a.png", PICTURES)

@@ -34,10 +34,8 @@ def coverage(shape, points, camera, size, device, samples=16):
 
 
 def sampling_error(perimeter, samples):
-    """Four standard deviations of an area [px] that is summed from ``samples`` a pixel, as random as they could be.
-
-    A pixel on the edge is covered by any share from 0 to 1, of which ``samples`` random ones know √(1/6 / samples).
-    """
+    """Four standard deviations of an area [px] that is summed from ``samples`` a pixel, as random as they could be."""
+    # A pixel on the edge is covered by any share from 0 to 1, of which ``samples`` random ones know √(1/6 / samples).
     return 4.0 * np.sqrt(perimeter / 6.0 / samples)
 
 
@@ -150,10 +148,8 @@ def sun_axes(z):
 
 
 def light(normals, camera):
-    """Light on planes with these unit normals (…, 3) that see the sun and the whole sky, as a fraction of that facing the sun.
-
-    A sky, 15 % brighter from above than from the side, gives 42 % of the light there, the sun 58 %.
-    """
+    """Light on planes with these unit normals (…, 3) that see the sun and the whole sky, over that of facing the sun."""
+    # A sky, 15 % brighter from above than from the side, gives 42 % of the light there, the sun 58 %.
     up = np.array([0.0, 1.0, 0.0])
     sun = camera.sun(up)
 
@@ -181,10 +177,8 @@ def test_a_plane_has_the_light_of_its_tilt(device, elevation):
 
 @pytest.mark.parametrize("elevation", [-20.0, 30.0])
 def test_a_wall_on_a_tilted_plane_hides_its_part_of_the_sky(device, elevation):
-    """Of rays with the density of cos θ about the normal, those that meet the wall within half the height of the picture.
-
-    They have 0.3 of their light. The sun is behind the plane. Rays are even to one in 100.
-    """
+    """Of rays with the density of cos θ about the normal, those that meet the wall within half the height of the picture."""
+    # They have 0.3 of their light. The sun is behind the plane. Rays are even to one in 100.
     away, length, fov = 0.3, 10.0, 40.0
     view = np.array([0.0, np.sin(np.radians(elevation)), np.cos(np.radians(elevation))])
     camera = Camera(6.0 * view, (0.0, 0.0, 0.0), fov=fov)
@@ -404,6 +398,13 @@ def test_a_framed_camera_sees_all_of_a_motion_and_no_more(azimuth, elevation, up
     assert abs(np.nanmax(np.abs(seen)) - 0.8) < 1e-9 and abs(np.nanmax(seen, axis=1) + np.nanmin(seen, axis=1)).min() < 1e-9
 
 
+def drawn(shape, *points, colours=None):
+    return RayCaster([shape], 4, 4).image(points, Camera((0, 0, 1), (0, 0, 0)), colours)
+
+
+COLOURS = r"colours\[0\] has shape \(3, 3\); it must be \(4, 3\) of vertices, \(2, 3, 3\) of corners"
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -421,22 +422,11 @@ def test_a_framed_camera_sees_all_of_a_motion_and_no_more(azimuth, elevation, up
         (lambda: RayCaster([], 4, 4, samples=0), "samples is 0"),
         (lambda: RayCaster([], 4, 4, ground=np.inf), "ground is inf"),
         (lambda: RayCaster([], 4, 4, contrast=2.0), "contrast is 2.0; it must be a number from 0 to 1"),
+        (lambda: drawn(Shape(4)), "points has 0 arrays; there are 1 shapes"),
+        (lambda: drawn(Shape(4), SQUARE[:3]), r"points\[0\] has shape \(3, 3\); it must be \(4, 3\)"),
+        (lambda: drawn(Shape(4, HALVES), SQUARE, colours=[np.ones((3, 3))]), COLOURS),
         (
-            lambda: RayCaster([Shape(4)], 4, 4).image([], Camera((0, 0, 1), (0, 0, 0))),
-            "points has 0 arrays; there are 1 shapes",
-        ),
-        (
-            lambda: RayCaster([Shape(4)], 4, 4).image([SQUARE[:3]], Camera((0, 0, 1), (0, 0, 0))),
-            r"points\[0\] has shape \(3, 3\); it must be \(4, 3\)",
-        ),
-        (
-            lambda: RayCaster([Shape(4, HALVES)], 4, 4).image([SQUARE], Camera((0, 0, 1), (0, 0, 0)), [np.ones((3, 3))]),
-            r"colours\[0\] has shape \(3, 3\); it must be \(4, 3\) of vertices, \(2, 3, 3\) of corners",
-        ),
-        (
-            lambda: RayCaster([Shape(4, HALVES)], 4, 4).image(
-                [SQUARE], Camera((0, 0, 1), (0, 0, 0)), [np.full((4, 3), np.nan)]
-            ),
+            lambda: drawn(Shape(4, HALVES), SQUARE, colours=[np.full((4, 3), np.nan)]),
             r"colours\[0\]\[0, 0\] is nan; it must be finite",
         ),
     ],

@@ -7,6 +7,7 @@ import pytest
 
 import warpcloth as wc
 from support.command_line import run
+from support.mesh_texts import usda
 from warpcloth.usd import read_scene, write_scene
 
 MESH = wc.Mesh.grid(4, 4, pattern="alternating")
@@ -49,10 +50,6 @@ def test_a_fabric_without_a_number_is_refused_by_its_name(name):
             fabric.bending()
     else:
         assert wc.Scene(MESH, fabric=replace(fabric, poisson_ratio=0.1)).density == fabric.density
-
-
-def test_every_record_says_where_it_is_from():
-    assert all(fabric.source and fabric.notes and name == fabric.name for name, fabric in wc.fabrics.items())
 
 
 def test_a_scene_takes_density_and_terms_from_it(device):
@@ -106,68 +103,35 @@ def test_a_thickness_that_is_not_known_or_not_the_same_gives_no_distance():
     assert joined.self_contact.distance == 5e-4
 
 
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"density": 0.1}, "fabric and density are given"),
-        ({"masses": np.ones(16)}, "fabric and masses are given"),
-        ({"terms": [wc.Spring(stiffness=1.0)]}, "fabric and terms are given"),
-        ({"fabric": "denin"}, "fabric is 'denin'; it must be one of cotton, wool"),
-        ({"fabric": 3}, "fabric is 3; it must be a Fabric or its name"),
-        ({"thickness": 1e-3}, "fabric and thickness are given"),
-        ({"fabric": None, "density": 0.1, "thickness": 0.0}, "thickness is 0.0; it must be"),
-    ],
-)
-def test_refusals_of_scenes(given, sentence):
+REFUSED_SCENES = [
+    ({"density": 0.1}, "fabric and density are given"),
+    ({"masses": np.ones(16)}, "fabric and masses are given"),
+    ({"terms": [wc.Spring(stiffness=1.0)]}, "fabric and terms are given"),
+    ({"fabric": "denin"}, "fabric is 'denin'; it must be one of cotton, wool"),
+    ({"fabric": 3}, "fabric is 3; it must be a Fabric or its name"),
+    ({"thickness": 1e-3}, "fabric and thickness are given"),
+    ({"fabric": None, "density": 0.1, "thickness": 0.0}, "thickness is 0.0; it must be"),
+]
+REFUSED_RECORDS = [
+    ({"density": 0.0}, "Fabric.density is 0"),
+    ({"density": 0.1, "shear": np.nan}, "Fabric.shear is nan"),
+    ({"density": None}, "Fabric.density is None"),
+    ({"density": 0.1, "source": 3}, "Fabric.source is 3; it must be a text"),
+    ({"density": 0.1, "computed": ("bogus",)}, r"Fabric.computed is \('bogus',\); it must be a tuple of names of density"),
+    ({"density": 0.1, "computed": ("name", [])}, r"Fabric.computed is \('name', \[\]\); it must be a tuple of names"),
+    ({"density": 0.1, "computed": "shear"}, "Fabric.computed is 'shear'; it must be a tuple of names"),
+]
+
+
+@pytest.mark.parametrize(("given", "sentence"), [*REFUSED_SCENES, *REFUSED_RECORDS])
+def test_refusals_of_scenes_and_records(given, sentence):
     with pytest.raises(ValueError, match=sentence):
-        wc.Scene(MESH, **{"fabric": "denim", **given})
+        wc.Fabric(name="felt", **given) if "Fabric." in sentence else wc.Scene(MESH, **{"fabric": "denim", **given})
 
 
-def test_one_record_is_printed_with_what_is_computed(capfd):
-    code, out, _ = run(capfd, "fabrics", "denim")
-    rows = dict(line.rsplit(maxsplit=1) for line in out.partition("\n\n")[0].splitlines())
-    assert code == 0 and rows["fabric"] == "denim" and rows["E₁t N/m"] == "1673" and rows["D₁ µN·m"] == "114.8*"
-    assert "* computed, not measured: D as E·t³/12(1 − ν₁₂ν₂₁)" in out and "Penava" not in out
-    code, out, _ = run(capfd, "fabrics", "denim-wang")
-    assert code == 0 and "D₁ µN·m  16\n" in out and "*" not in out
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"density": 0.0}, "Fabric.density is 0"),
-        ({"density": 0.1, "shear": np.nan}, "Fabric.shear is nan"),
-        ({"density": None}, "Fabric.density is None"),
-        ({"density": 0.1, "source": 3}, "Fabric.source is 3; it must be a text"),
-        ({"density": 0.1, "computed": ("bogus",)}, r"Fabric.computed is \('bogus',\); it must be a tuple of names of density"),
-        ({"density": 0.1, "computed": ("name", [])}, r"Fabric.computed is \('name', \[\]\); it must be a tuple of names"),
-        ({"density": 0.1, "computed": "shear"}, "Fabric.computed is 'shear'; it must be a tuple of names"),
-    ],
-)
-def test_refusals_of_records(given, sentence):
-    with pytest.raises(ValueError, match=sentence):
-        wc.Fabric(name="felt", **given)
-
-
-STAGE = """#usda 1.0
-(
-    defaultPrim = "Cloth"
-    metersPerUnit = 1
-    upAxis = "Y"
-)
-
-def Mesh "Cloth"
-{
-    int[] faceVertexCounts = [3, 3]
-    int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
-    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1)]
-    texCoord2f[] primvars:st = [(0, 0), (0, 1), (-1, 0), (-1, 1)] (
-        interpolation = "vertex"
-    )
-    token warpcloth:fabric = "silk"
-    DENSITY
-}
-"""
+POINTS, FACES = [(0, 0, 0), (1, 0, 0), (0, 0, 1), (1, 0, 1)], [(0, 2, 1), (1, 2, 3)]
+ST = 'texCoord2f[] primvars:st = [(0, 0), (0, 1), (-1, 0), (-1, 1)] (interpolation = "vertex")'
+STAGE = usda(POINTS, FACES, f'{ST}\ntoken warpcloth:fabric = "silk"\nDENSITY')
 
 
 def test_a_stage_names_one(tmp_path):
@@ -259,101 +223,70 @@ def test_a_material_of_the_published_code_is_its_record(tmp_path):
     assert found.poisson_ratio == 0.0  # as k₁₂ is below 0
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "sentence"),
-    [
-        ("a.json", "{", "a.json, line 1: Expecting property name"),
-        ("a.json", '{"density": 0.1, "stretching": [1, 2, 3, 4]}', "a.json: has no bending; a material of ARCSim must"),
-        (
-            "a.json",
-            ARCSIM.replace("100,", ""),
-            r"a.json: stretching begins with \[50.0, 10.0, 30.0\]; it must be a row of 4 numbers",
-        ),
-        ("a.json", ARCSIM.replace("[1, 1], ", ""), "a.json: bending is .*; it must be rows of numbers"),
-        ("a.json", ARCSIM.replace("0.2", "-1"), "a.json: Fabric.density is -1"),
-        ("a.json", '{"note": "für"}', "a.json: is no text in UTF-8, 'utf-8' codec can't decode byte 0xfc in position 11"),
-        (
-            "a.csv",
-            "name,W,EMT,WT,LT\nwool,20,4,8,99\n",
-            r"a.csv, line 2: LT of direction 1 is 99, but 2WT/.* is 0.8; must",
-        ),
-        ("a.txt", "", "a.txt: is a .txt; it must be .json of ARCSim or .csv"),
-        ("a.csv", "name,W\nwool,1\n", "a.csv: has no columns of either KES-F"),
-        ("a.csv", "name,W,LT,E5\nwool,1,1,1\n", "a.csv: has columns of both KES-F"),
-        ("a.csv", "W,LT\n1,1\n", "a.csv: has no column 'name'"),
-        ("a.csv", "name,W,LT\nwool,1,1\nwool,1,1\n", "a.csv, line 3: name is 'wool', as before; each fabric must have its own"),
-        ("a.csv", "name,W,B1,B warp,LT\nwool,1,1,1,1\n", "a.csv: columns 'B1' and 'B warp' are the same number"),
-        ("a.csv", "name,W,LT\nwool,,1\n", "a.csv, line 2: fabric 'wool' has no W, the weight"),
-        ("a.csv", "name,W,LT\nwool,1,-1\n", "a.csv, line 2: LT is -1.0; it must be a number from 0.0001 to 1e"),
-        (
-            "a.csv",
-            "name,W,E5,E20\nwool,1,2,1\n",
-            "a.csv, line 2: E20 of direction 1 is 1.0, E5 is 2.0; E20 must be larger by 0.005 or more",
-        ),
-        (
-            "a.csv",
-            "name,W,E5,E20\nwool,1,2,2\n",
-            "a.csv, line 2: E20 of direction 1 is 2.0, E5 is 2.0; E20 must be larger by 0.005 or more",
-        ),
-        (
-            "a.csv",
-            "name,W,E5,E20\nwool,1,1,1.0000000000000002\n",
-            "E20 of direction 1 is 1.0000000000000002, E5 is 1.0; E20 must",
-        ),
-        *(
-            (
-                "a.csv",
-                f"name,W,{names}\nwool,1,{numbers}\n",
-                r"a.csv, line 2: \w+ is \S+; it must be a number from 0.0001 to 1e",
-            )
-            for names, numbers in (
-                ("EMT,WT", "1e-300,10"),
-                ("EMT,WT", "5,inf"),
-                ("WT,LT", "1e-320,0.6"),
-                ("EMT,LT", "1e300,0.6"),
-                ("E5,E20", "1e-320,2e-320"),
-                ("E100", "nan"),
-                ("E100,C", "1,1e200"),
-                ("LT,G1,G2", "1,1e308,1e308"),
-            )
-        ),
-        ("a.csv", "name,W,EMT,WT\nwool,1,0.001,8\n", "WT of direction 1 is 8; it must be at most 500 gf/cm·EMT, 0.005"),
-        (
-            "a.json",
-            ARCSIM.replace("{", '{"density": 1, ', 1),
-            "a.json: 'density' occurs twice in one JSON object; each name must",
-        ),
-        ("a.json", ARCSIM.replace("{", '{"note": {"a": 1, "a": 1}, ', 1), "a.json: 'a' occurs twice in one JSON object"),
-        ("a.json", ARCSIM.replace("0.2", "1" * 5001), "a.json: Fabric.density is inf; it must be a number above 0, and finite"),
-        (
-            "a.json",
-            ARCSIM.replace("100,", "1" * 400 + ","),
-            r"a.json: stretching begins with \[50.0, 10.0, inf, 30.0\]; it must",
-        ),
-        ("a.json", "[" * 100_000, "a.json: is nested too deeply; it must be a JSON object"),
-        ("a.json", ARCSIM.replace("10, 100", "80, 20"), r"begins with \[50.0, 80.0, 20.0, 30.0\], .*; k₁₂² must be below k₁k₂"),
-        (
-            "a.json",
-            ARCSIM.replace("50, 10, 100", "1e200, 1e200, 1e200"),
-            "a.json: stretching begins .*; k₁₂² must be below k₁k₂",
-        ),
-        (
-            "a.json",
-            ARCSIM.replace("50, 10, 100", "1e308, 1e160, 1e200"),
-            "a.json: Fabric.warp is inf; it must be a number above 0",
-        ),
-        ("a.json", ARCSIM.replace("100, 30", "100, 0"), "the fourth number must be above 0"),
-        ("a.json", ARCSIM.replace("24e-6", "-24e-6"), "bending begins with -2.4e-05 at 0° and 1.6e-05 at 90°; they must be"),
+def arcsim(old, new):
+    return ARCSIM.replace(old, new, 1)
+
+
+LARGER = ", line 2: E20 of direction 1 is {}, E5 is {}; E20 must be larger by 0.005 or more"
+REFUSED = {  # by ending: text, and what follows the name of the file
+    "json": [
+        ("{", ", line 1: Expecting property name"),
+        ('{"density": 0.1, "stretching": [1, 2, 3, 4]}', ": has no bending; a material of ARCSim must"),
+        (arcsim("100,", ""), r": stretching begins with \[50.0, 10.0, 30.0\]; it must be a row of 4 numbers"),
+        (arcsim("[1, 1], ", ""), ": bending is .*; it must be rows of numbers"),
+        (arcsim("0.2", "-1"), ": Fabric.density is -1"),
+        ('{"note": "für"}', ": is no text in UTF-8, 'utf-8' codec can't decode byte 0xfc in position 11"),
+        (arcsim("{", '{"density": 1, '), ": 'density' occurs twice in one JSON object; each name must"),
+        (arcsim("{", '{"note": {"a": 1, "a": 1}, '), ": 'a' occurs twice in one JSON object"),
+        (arcsim("0.2", "1" * 5001), ": Fabric.density is inf; it must be a number above 0, and finite"),
+        (arcsim("100,", "1" * 400 + ","), r": stretching begins with \[50.0, 10.0, inf, 30.0\]; it must"),
+        ("[" * 100_000, ": is nested too deeply; it must be a JSON object"),
+        (arcsim("10, 100", "80, 20"), r".*begins with \[50.0, 80.0, 20.0, 30.0\], .*; k₁₂² must be below k₁k₂"),
+        (arcsim("50, 10, 100", "1e200, 1e200, 1e200"), ": stretching begins .*; k₁₂² must be below k₁k₂"),
+        (arcsim("50, 10, 100", "1e308, 1e160, 1e200"), ": Fabric.warp is inf; it must be a number above 0"),
+        (arcsim("100, 30", "100, 0"), ".*the fourth number must be above 0"),
+        (arcsim("24e-6", "-24e-6"), ".*bending begins with -2.4e-05 at 0° and 1.6e-05 at 90°; they must be"),
     ],
-)
-def test_refusals_of_files(name, text, sentence, tmp_path):
-    (tmp_path / name).write_text(text, encoding="latin-1")
-    with pytest.raises(ValueError, match=sentence):
-        wc.read_fabrics(tmp_path / name)
+    "csv": [
+        ("EMT,WT,LT\nwool,20,4,8,99", r", line 2: LT of direction 1 is 99, but 2WT/.* is 0.8; must"),
+        ("\nwool,1", ": has no columns of either KES-F"),
+        ("LT,E5\nwool,1,1,1", ": has columns of both KES-F"),
+        ("LT\nwool,1,1\nwool,1,1", ", line 3: name is 'wool', as before; each fabric must have its own"),
+        ("B1,B warp,LT\nwool,1,1,1,1", ": columns 'B1' and 'B warp' are the same number"),
+        ("LT\nwool,,1", ", line 2: fabric 'wool' has no W, the weight"),
+        ("LT\nwool,1,-1", ", line 2: LT is -1.0; it must be a number from 0.0001 to 1e"),
+        ("E5,E20\nwool,1,2,1", LARGER.format("1.0", "2.0")),
+        ("E5,E20\nwool,1,2,2", LARGER.format("2.0", "2.0")),
+        ("E5,E20\nwool,1,1,1.0000000000000002", LARGER.format("1.0000000000000002", "1.0")),
+        ("EMT,WT\nwool,1,0.001,8", ".*WT of direction 1 is 8; it must be at most 500 gf/cm·EMT, 0.005"),
+    ],
+    "txt": [("", ": is a .txt; it must be .json of ARCSim or .csv")],
+}
+OUTSIDE = ("EMT,WT 1e-300,10", "EMT,WT 5,inf", "WT,LT 1e-320,0.6", "EMT,LT 1e300,0.6", "E5,E20 1e-320,2e-320", "E100 nan")
+for given in (*OUTSIDE, "E100,C 1,1e200", "LT,G1,G2 1,1e308,1e308"):
+    row = given.replace(" ", "\nwool,1,")
+    REFUSED["csv"].append((row, r", line 2: \w+ is \S+; it must be a number from 0.0001 to 1e"))
+REFUSED["csv"] = [("name,W" + ("," * (text[0] != "\n")) + text + "\n", sentence) for text, sentence in REFUSED["csv"]]
+REFUSED["csv"].append(("W,LT\n1,1\n", ": has no column 'name'"))
+
+
+@pytest.mark.parametrize(("ending", "text", "sentence"), [(ending, *row) for ending, rows in REFUSED.items() for row in rows])
+def test_refusals_of_files(ending, text, sentence, tmp_path):
+    (tmp_path / f"a.{ending}").write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=f"a.{ending}{sentence}"):
+        wc.read_fabrics(tmp_path / f"a.{ending}")
 
 
 def test_the_command_lists_them(capfd):
+    """And says where each is from."""
+    assert all(fabric.source and fabric.notes and name == fabric.name for name, fabric in wc.fabrics.items())
     code, out, _ = run(capfd, "fabrics")
     assert code == 0 and all(name in out for name in wc.fabrics) and "1673" in out and "Clyde" in out
     drapes = {line.split()[0]: line.split()[-2] for line in out.splitlines()[1 : 1 + len(wc.fabrics)]}
     assert drapes["silk"] == "52.1*" and drapes["denim-wang"] == "–"  # which has no ν₁₂
+    code, out, _ = run(capfd, "fabrics", "denim")  # with what is computed
+    rows = dict(line.rsplit(maxsplit=1) for line in out.partition("\n\n")[0].splitlines())
+    assert code == 0 and rows["fabric"] == "denim" and rows["E₁t N/m"] == "1673" and rows["D₁ µN·m"] == "114.8*"
+    assert "* computed, not measured: D as E·t³/12(1 − ν₁₂ν₂₁)" in out and "Penava" not in out
+    code, out, _ = run(capfd, "fabrics", "denim-wang")
+    assert code == 0 and "D₁ µN·m  16\n" in out and "*" not in out

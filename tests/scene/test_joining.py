@@ -25,25 +25,13 @@ def cloths():
     grid, other = wc.Mesh.grid(6, 6), wc.Mesh.grid(7, 5, pattern="alternating")
     other = wc.Mesh(other.points + np.array([2.0, 0.0, 0.0]), other.triangles)
     start = grid.points[[0, 5]]
-    heavy = wc.Scene(
-        grid,
-        density=0.4,
-        terms=[wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)],
-        pins=wc.Pins([0, 5], keyframes=[start, start + np.array([0.0, 0.01, 0.0])]),
-        duration=0.1,
-    )
-    light = wc.Scene(
-        other,
-        density=0.05,
-        terms=[wc.Spring(stiffness=np.linspace(80.0, 120.0, len(other.edges)))],
-        pins=wc.Pins("x < 2.01", axes="xz"),
-        velocities=np.tile([0.0, 0.0, 0.3], (35, 1)),
-        loads=[
-            wc.Force(vertices=[34, 33], force=[[0.0, 0.01, 0.0], [0.0, 0.0, 0.02]]),
-            wc.Pressure(vertices="all", pressure=1.0),
-        ],
-        duration=0.1,
-    )
+    given = {"density": 0.4, "terms": [wc.Spring(stiffness=1e3), wc.QuadraticBending(stiffness=1e-4)]}
+    given |= {"pins": wc.Pins([0, 5], keyframes=[start, start + np.array([0.0, 0.01, 0.0])]), "duration": 0.1}
+    heavy = wc.Scene(grid, **given)
+    force = wc.Force(vertices=[34, 33], force=[[0.0, 0.01, 0.0], [0.0, 0.0, 0.02]])
+    given = {"terms": [wc.Spring(stiffness=np.linspace(80.0, 120.0, len(other.edges)))], "pins": wc.Pins("x < 2.01", axes="xz")}
+    given |= {"velocities": np.tile([0.0, 0.0, 0.3], (35, 1)), "loads": [force, wc.Pressure(vertices="all", pressure=1.0)]}
+    light = wc.Scene(other, density=0.05, duration=0.1, **given)
     return {"heavy": heavy, "light": light}
 
 

@@ -8,40 +8,32 @@ import trimesh
 
 import warpcloth as wc
 from support.command_line import run
+from support.mesh_texts import TEXTS
 from warpcloth.run.scene_files import find_source
 from warpcloth.usd import read_scene
 
 GRID = wc.Mesh.grid(5, 5)
 
 
-def obj(points):
-    """The text of an .obj file."""
-    faces = "".join(f"f {a} {b} {c}\n" for a, b, c in GRID.triangles + 1)
-    return "".join(f"v {x} {y} {z}\n" for x, y, z in points) + faces
+def obj(points=GRID.points):
+    return TEXTS["obj"](points, GRID.triangles.tolist())
 
 
-def stage(points, st=None, indices=None, warp=None):
+def stage(points=GRID.points, st=None, indices=None, warp=None):
     """The text of a stage with a mesh alone, as a modeller writes it."""
-    lines = [
-        f"point3f[] points = {[tuple(point) for point in points]}",
-        f"int[] faceVertexCounts = {[3] * len(GRID.triangles)}",
-    ]
-    lines.append(f"int[] faceVertexIndices = {GRID.triangles.ravel().tolist()}")
+    lines = [] if warp is None else [f"double3 warpcloth:warp = {warp}"]
     if st is not None:
         kind = "vertex" if indices is None else "faceVarying"
         lines.append(f'texCoord2f[] primvars:st = {[tuple(pair) for pair in st]} (interpolation = "{kind}")')
     if indices is not None:
         lines.append(f"int[] primvars:st:indices = {indices}")
-    if warp is not None:
-        lines.append(f"double3 warpcloth:warp = {warp}")
-    head = '#usda 1.0\n(\n    defaultPrim = "Cloth"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n'
-    return head + 'def Mesh "Cloth"\n{\n' + "".join(f"    {line}\n" for line in lines) + "}\n"
+    return TEXTS["usda"](points, GRID.triangles.tolist(), "\n".join(lines))
 
 
 @pytest.fixture
 def sheet(tmp_path):
     path = tmp_path / "sheet.obj"
-    path.write_text(obj(GRID.points.tolist()))
+    path.write_text(obj())
     return path
 
 
@@ -80,8 +72,7 @@ def test_options_of_the_command_line_are_those_of_the_mesh(sheet, tmp_path, capf
 @pytest.mark.parametrize("kind", ["mesh", "stage"])
 def test_a_cloth_that_is_too_large_is_said_with_the_likely_unit(tmp_path, kind, scale, hint, recwarn):
     path = tmp_path / ("sheet.obj" if kind == "mesh" else "sheet.usda")
-    points = [(scale * x, scale * y, scale * z) for x, y, z in GRID.points.tolist()]
-    path.write_text(obj(points) if kind == "mesh" else stage(points))
+    path.write_text(obj(scale * GRID.points) if kind == "mesh" else stage(scale * GRID.points))
     source = find_source(path)
     source.scene(source.values({"fabric": "cotton"}))
     said = [str(warning.message) for warning in recwarn if " m long and has " in str(warning.message)]
@@ -105,7 +96,7 @@ def test_an_up_axis_is_given_where_the_file_has_none(tmp_path, ending, given, ax
     if ending == "glb":
         trimesh.Trimesh(GRID.points, GRID.triangles).export(path)
     else:
-        path.write_text(obj(GRID.points.tolist()) if ending == "obj" else stage(GRID.points.tolist()))
+        path.write_text(obj() if ending == "obj" else stage())
     if axis in (None, "Y", "Z"):
         assert wc.Mesh.load(path, up_axis=given).up_axis == axis
     else:
@@ -131,7 +122,7 @@ CORNERS = {"st": [*UV["st"], (0, 0)], "indices": GRID.triangles.ravel().tolist()
 )
 def test_the_warp_of_a_fabric_on_a_stage(tmp_path, turned, given, warp, says, recwarn):
     path = tmp_path / "sheet.usda"
-    path.write_text(stage(GRID.points[:, turned].tolist(), **given))
+    path.write_text(stage(GRID.points[:, turned], **given))
     scene = read_scene(path, fabric="denim")
     for term in scene.terms:
         assert np.allclose(term.warp_directions(scene.mesh), warp)
@@ -146,12 +137,12 @@ def test_the_warp_of_a_fabric_on_a_stage(tmp_path, turned, given, warp, says, re
         ("obj", "0,1", "warp has shape (2,); it must be (3,)"),
         ("obj", "s", "warp is 's'; it must be three numbers, such as 0,0,1"),
         ("obj", "0,0,nan", "warp[2] is nan; it must be finite"),
-        ("usda", (0, 1, 0), "prim /Cloth: warp (warpcloth:warp) has no direction in triangle 0"),
+        ("usda", (0, 1, 0), "prim /Sheet: warp (warpcloth:warp) has no direction in triangle 0"),
     ],
 )
 def test_a_warp_that_is_none_is_refused_by_the_name_that_was_written(tmp_path, ending, warp, says):
     path = tmp_path / f"sheet.{ending}"
-    path.write_text(obj(GRID.points.tolist()) if ending == "obj" else stage(GRID.points.tolist(), warp=warp))
+    path.write_text(obj() if ending == "obj" else stage(warp=warp))
     source = find_source(path)
     with pytest.raises(ValueError, match=re.escape(says)):
         source.scene(source.values({"fabric": "denim"} | ({"warp": warp} if ending == "obj" else {})))
@@ -162,13 +153,8 @@ def test_a_mesh_that_faces_x_in_part_has_a_warp_everywhere():
     angle, z = np.pi * GRID.points[:, 0], GRID.points[:, 2]
     tube = wc.Mesh(np.stack([np.sin(angle), np.cos(angle), z], axis=1), GRID.triangles)
     with pytest.warns(UserWarning, match="along x, or along y where triangles face x"):
-        scene = wc.Scene(
-            wc.Mesh(
-                np.concatenate([tube.points, GRID.points[:, [1, 0, 2]] + 5.0]),
-                np.concatenate([GRID.triangles, GRID.triangles + 25]),
-            ),
-            fabric="denim",
-        )
+        points = np.concatenate([tube.points, GRID.points[:, [1, 0, 2]] + 5.0])
+        scene = wc.Scene(wc.Mesh(points, np.concatenate([GRID.triangles, GRID.triangles + 25])), fabric="denim")
     assert np.isfinite(scene.terms[0].warp_directions(scene.mesh)).all()
     with pytest.raises(ValueError, match="warp is given without fabric"):
         wc.Scene(GRID, density=0.1, terms=[wc.Spring(stiffness=1.0)], warp=(1, 0, 0))

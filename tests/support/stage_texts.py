@@ -1,4 +1,4 @@
-"""Valid stages as text."""
+"""Valid stages as text, and texts that make others."""
 
 STAGE = """#usda 1.0
 (
@@ -75,3 +75,8 @@ def BasisCurves "Cloth"
     }
 }
 """
+
+
+def prim(kind, name, *texts, meta=""):
+    """A prim of which each text is on a line of its own."""
+    return f'def {kind} "{name}" {meta}\n{{\n' + "\n".join(texts) + "\n}\n"

@@ -1,5 +1,8 @@
 """Stages of artists and of this package, whose numbers tell the frame, the vertex and the run that they belong to."""
 
+import os
+from itertools import count
+
 import numpy as np
 import trimesh
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
@@ -150,3 +153,16 @@ def measure(output, mesh, source=None, codes=CODES, single_file=False, sign=1.0,
             writer.append(code, primvars, colours if options["coloured"] else None, directions, points)
         writer.close(single_file=single_file)
     return writer.path
+
+
+def full_from(step, monkeypatch, once=True):
+    """Lets the rename of that number fail, and those after it too unless ``once``, as where a disk is full."""
+    steps, rename = count(), os.replace
+
+    def replace(*paths):
+        now = next(steps)
+        if now == step or (now > step and not once):
+            raise OSError("no space left on device")
+        rename(*paths)
+
+    monkeypatch.setattr(os, "replace", replace)

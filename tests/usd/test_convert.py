@@ -13,6 +13,8 @@ import pytest
 from pxr import Usd
 
 import warpcloth as wc
+from support.mesh_texts import obj
+from support.stages import full_from
 from warpcloth.base import outputs
 from warpcloth.cli import main
 from warpcloth.mesh.mesh import Surface
@@ -101,19 +103,15 @@ def test_an_error_or_interrupt_leaves_older_files_whole(name, older, stage, tmp_
     assert all(path.stat().st_mode & 0o777 == 0o600 for path in private)
 
 
-def test_an_interrupt_while_a_file_is_opened_leaves_nothing(stage, tmp_path, monkeypatch):
-    monkeypatch.setattr(outputs, "keep_mode", lambda *paths: signal.raise_signal(signal.SIGINT))
+def test_obj_files_of_which_one_cannot_be_opened_or_renamed(stage, tmp_path, monkeypatch):
+    """An interrupt while the first is opened leaves nothing; those that are renamed stay if the next cannot be."""
     (tmp_path / "out").mkdir()
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(outputs, "keep_mode", lambda *paths: signal.raise_signal(signal.SIGINT))
         convert(stage, tmp_path / "out" / "a.obj")
     assert not list((tmp_path / "out").iterdir())
-
-
-def test_files_that_are_renamed_stay_if_the_next_cannot_be(stage, tmp_path, monkeypatch):
-    left, rename = [None, None], os.replace
-    monkeypatch.setattr(outputs.os, "replace", lambda *paths: (left.pop(), rename(*paths)))
-    (tmp_path / "out").mkdir()
-    with pytest.raises(IndexError):
+    full_from(2, monkeypatch)
+    with pytest.raises(OSError, match="no space left"):
         convert(stage, tmp_path / "out" / "a.obj")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a_0000.obj", "a_0001.obj"]
 
@@ -122,21 +120,14 @@ def test_files_that_are_renamed_stay_if_the_next_cannot_be(stage, tmp_path, monk
 @pytest.mark.parametrize("ending", ["usda", "usdc", "usdz"])
 def test_a_stage_of_which_a_file_cannot_be_renamed_leaves_nothing(ending, older, stage, tmp_path, monkeypatch):
     """Whichever it is: the rest shape, the manifest, the frames, the root, the layer of a package or that."""
-    out, rename = tmp_path / "out", os.replace
+    out = tmp_path / "out"
     out.mkdir()
     if older:
         convert(stage, out / f"a.{ending}")
     before, failed = contents(out), 0
     while True:
-        left = iter(range(failed))
-
-        def full(*paths, left=left):
-            if next(left, None) is None:
-                raise OSError("no space left on device")
-            rename(*paths)
-
         with monkeypatch.context() as patch:
-            patch.setattr(outputs.os, "replace", full)
+            full_from(failed, patch, once=False)
             try:
                 convert(stage, out / f"a.{ending}")
             except OSError:
@@ -201,9 +192,12 @@ def test_a_conversion_keeps_unfinished_files_of_another_that_runs(held, numbered
     assert not left.exists()
 
 
-def test_formats_are_those_of_others(stage, tmp_path):
+def test_formats_are_those_of_others(stage, tmp_path, capfd):
     """The bytes of the headers, and names of frames."""
-    convert(stage, tmp_path / "c.pc2")
+    assert main(["convert", str(stage), str(tmp_path / "c.pc2")]) == 0
+    assert f"c.pc2 and {tmp_path / 'c.obj'}: {COUNT} frames of 12 vertices" in capfd.readouterr().out
+    assert main(["convert", str(tmp_path / "c.pc2"), str(tmp_path / "b.ply"), "--json"]) == 0
+    assert '"frames": 5' in capfd.readouterr().out
     data = (tmp_path / "c.pc2").read_bytes()
     assert struct.unpack("<12siiffi", data[:32]) == (b"POINTCACHE2\0", 1, 12, 0.0, 1.0, COUNT) and len(data) == 32 + 12 * 12 * 5
     convert(stage, tmp_path / "c.mdd")
@@ -289,12 +283,11 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
     saved(tmp_path / "empty.npz", points=points[:0], triangles=mesh.triangles)
     saved(tmp_path / "untimed.npz", **good)
     saved(tmp_path / "uneven.npz", **good, times=[0.0, 1.0, 3.0])
-    (tmp_path / "mixed").mkdir()
+    for folder in ("mixed", "far"):
+        (tmp_path / folder).mkdir()
     for frame, width in enumerate((3, 3, 4)):
         shape = wc.Mesh.grid(3, width)
-        text = "".join(f"v {x} {y} {z}\n" for x, y, z in shape.points)
-        (tmp_path / "mixed" / f"f{frame}.obj").write_text(text + "".join(f"f {a} {b} {c}\n" for a, b, c in shape.triangles + 1))
-    (tmp_path / "far").mkdir()
+        (tmp_path / "mixed" / f"f{frame}.obj").write_text(obj(shape.points, shape.triangles))
     (tmp_path / "far" / "f0.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/1 100/1\nf 1 2 3\n")
     with AnimationWriter(tmp_path / "chain.usdc", wc.Mesh.chain(3), FPS) as writer:
         writer.append(np.zeros((3, 3)), np.zeros((3, 3)))
@@ -343,13 +336,6 @@ def test_wrong_input_is_refused_in_a_sentence(stage, tmp_path, capfd):
         out, err = capfd.readouterr()
         assert code == 2 and re.search(says, err) and err.count("\n") == 1 and not out, (words, err)
         assert contents(tmp_path) == before, words
-
-
-def test_the_command(stage, tmp_path, capfd):
-    assert main(["convert", str(stage), str(tmp_path / "a.pc2")]) == 0
-    assert f"a.pc2 and {tmp_path / 'a.obj'}: {COUNT} frames of 12 vertices" in capfd.readouterr().out
-    assert main(["convert", str(tmp_path / "a.pc2"), str(tmp_path / "b.ply"), "--json"]) == 0
-    assert '"frames": 5' in capfd.readouterr().out
 
 
 def test_frames_are_streamed(tmp_path):

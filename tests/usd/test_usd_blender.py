@@ -73,39 +73,22 @@ def Xform "root"
 PINNED = [0, 4, 8]
 SUBSET = 'def GeomSubset "pins"\n{{\n{}\n}}'
 # A vertex group, a boolean attribute, the faces of a material or face set (their corners), and a custom property.
+PRIMVAR = ' primvars:pins = [{}, 0, 0, 0] (interpolation = "vertex")'
+FACES = 'uniform token elementType = "face"\nuniform token familyName = "materialBind"\nint[] indices = [0, 3]'
 PINS = {
-    "vertex group": (
-        "DATA",
-        'float[] primvars:pins = [1, 0, 0, 0, 0.5, 0.49, 0, 0, 1, 0, 0, 0] (interpolation = "vertex")',
-        PINNED,
-    ),
-    "boolean": ("DATA", 'bool[] primvars:pins = [1, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0] (interpolation = "vertex")', PINNED),
-    "material": (
-        "DATA",
-        """def GeomSubset "pins" (prepend apiSchemas = ["MaterialBindingAPI"])
-                {
-                    uniform token elementType = "face"
-                    uniform token familyName = "materialBind"
-                    int[] indices = [0, 3]
-                }""",
-        [0, 1, 4, 5, 8, 9],
-    ),
-    "property of the object": ("OBJECT", 'custom string warpcloth:pins = "x == 0"', PINNED),
-    "property of the data": ("DATA", 'custom string warpcloth:pins = "index(0, 4, 8)"', PINNED),
-    "indices": ("DATA", "int[] warpcloth:pins = [8, 4, 0]", PINNED),
-    "two of them": (
-        "DATA",
-        """string warpcloth:pins = "index(4, 8)"
-                float[] primvars:pins = [1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0] (interpolation = "vertex")""",
-        PINNED,
-    ),
+    "vertex group": "float[]" + PRIMVAR.format("1, 0, 0, 0, 0.5, 0.49, 0, 0, 1"),
+    "boolean": "bool[]" + PRIMVAR.format("1, 0, 0, 0, 1, 0, 0, 0, 1"),
+    "material": SUBSET.format(FACES).replace('"pins"', '"pins" (prepend apiSchemas = ["MaterialBindingAPI"])'),
+    "property of the object": 'custom string warpcloth:pins = "x == 0"',
+    "property of the data": 'custom string warpcloth:pins = "index(0, 4, 8)"',
+    "indices": "int[] warpcloth:pins = [8, 4, 0]",
+    "two of them": 'string warpcloth:pins = "index(4, 8)"\nfloat[]' + PRIMVAR.format("1, 0, 0, 0, 1, 0, 0, 0, 0"),
 }
 
 
 def flag(path, pins="vertex group"):
-    where, text, _ = PINS[pins] if pins in PINS else ("DATA", pins, None)
-    texts = {"OBJECT": "", "DATA": ""} | {where: text}
-    path.write_text(FLAG.replace("OBJECT", texts["OBJECT"]).replace("DATA", texts["DATA"]))
+    where = ("OBJECT", "DATA") if "object" in pins else ("DATA", "OBJECT")
+    path.write_text(FLAG.replace(where[0], PINS.get(pins, pins)).replace(where[1], ""))
     return path
 
 
@@ -119,21 +102,19 @@ def of_pole(local, frame):
 
 @pytest.mark.parametrize("pins", PINS)
 def test_pins_of_a_stage_from_blender(tmp_path, pins):
-    assert read_scene(flag(tmp_path / "flag.usda", pins)).pins.vertices.tolist() == PINS[pins][2]
+    expected = [0, 1, 4, 5, 8, 9] if pins == "material" else PINNED
+    assert read_scene(flag(tmp_path / "flag.usda", pins)).pins.vertices.tolist() == expected
+
+
+CHANGING = f"float[] primvars:pins.timeSamples = {{1: {[1] * 12}, 2: {[0] * 12}}}"
 
 
 @pytest.mark.parametrize(
     ("pins", "message"),
     [
         ("float[] primvars:pins = [1, 0]", r"primvars:pins has shape \(2,\), must have a number for each of 12 points"),
-        (
-            f"float[] primvars:pins.timeSamples = {{1: {[1] * 12}, 2: {[0] * 12}}}",
-            "primvars:pins changes over time, must have one",
-        ),
-        (
-            SUBSET.format('token elementType = "edge"'),
-            "GeomSubset pins: elementType is 'edge', must be 'point' or 'face'",
-        ),
+        (CHANGING, "primvars:pins changes over time, must have one"),
+        (SUBSET.format('token elementType = "edge"'), "GeomSubset pins: elementType is 'edge', must be 'point' or 'face'"),
         (SUBSET.format("int[] indices = [7]"), r"GeomSubset pins: indices\[0\] = 7, must be a face, 0 to 5"),
         ("custom int2 warpcloth:pins = (0, 4)", r"warpcloth:pins has type int2, must be string or int\[\]"),
         ('custom string warpcloth:pins = "left"', "'left'"),
@@ -144,13 +125,6 @@ def test_pins_that_are_refused(tmp_path, pins, message):
     with pytest.raises(ValueError, match=message) as caught:
         read_scene(flag(tmp_path / "flag.usda", pins))
     assert "prim /root/Pole/Flag/FlagMesh: " in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_attributes_of_an_object_with_shape_keys(tmp_path):
-    """Blender makes a SkelRoot of it."""
-    path = flag(tmp_path / "flag.usda")
-    path.write_text(path.read_text().replace('Xform "Flag"', 'SkelRoot "Flag"'))
-    assert read_scene(path).density == 0.15
 
 
 @pytest.mark.parametrize("prim", [None, "Flag", "/root/Pole/Flag", "FlagMesh"])
@@ -179,9 +153,13 @@ def test_a_flag_that_is_keyed_as_an_object_follows_its_pole(tmp_path, prim):
     assert np.abs(velocities).max() > 0.1
 
 
-def test_a_stage_from_blender_is_drawn_with_its_pins(tmp_path):
-    (prim,) = read_drawn(str(flag(tmp_path / "flag.usda"))).prims
+def test_a_stage_from_blender_is_drawn_with_its_pins_and_shape_keys_keep_attributes(tmp_path):
+    """Blender makes a SkelRoot of an object with shape keys."""
+    path = flag(tmp_path / "flag.usda")
+    (prim,) = read_drawn(str(path)).prims
     assert prim.pins.tolist() == PINNED
+    path.write_text(path.read_text().replace('Xform "Flag"', 'SkelRoot "Flag"'))
+    assert read_scene(path).density == 0.15
 
 
 # A ball of 0.4 m, whose mesh is that of an octahedron, keyed from one side of the flag to the other.

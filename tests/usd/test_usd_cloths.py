@@ -6,55 +6,32 @@ import numpy as np
 import pytest
 
 import warpcloth as wc
+from support.stage_texts import prim
 from warpcloth.usd import FrameSequence, read_mesh, read_scene
 
-STAGE = """#usda 1.0
-(
-    metersPerUnit = 0.01
-    upAxis = "Y"
-    timeCodesPerSecond = 60
-)
+QUAD = [(0, 0, 0), (100, 0, 0), (0, 0, 100), (100, 0, 100)]
 
-def Xform "Figure"
-{{
-    def Mesh "Skirt"
-    {{
-        int[] faceVertexCounts = [4]
-        int[] faceVertexIndices = [0, 2, 3, 1]
-        point3f[] points = [(0, 0, 0), (100, 0, 0), (0, 0, 100), (100, 0, 100)]
-        double warpcloth:density = 0.4
-        double warpcloth:duration = 0.1
-        double warpcloth:selfContact:distance = 0.002
-        token warpcloth:terms:threads:type = "Spring"
-        double warpcloth:terms:threads:stiffness = 1000
-        int[] warpcloth:pins = [0, 1]
-    }}
-    def Mesh "Belt"
-    {{
-        int[] faceVertexCounts = [3, 3]
-        int[] faceVertexIndices = [0, 2, 1, 1, 2, 3]
-        point3f[] points = [(0, 10, 0), (100, 10, 0), (0, 10, 100), (90, 10, 100)]
-        double3 xformOp:translate = (0, 5, 0)
-        uniform token[] xformOpOrder = ["xformOp:translate"]
-        double warpcloth:density = 0.05
-        {more}
-        token warpcloth:terms:threads:type = "Spring"
-        double warpcloth:terms:threads:stiffness = 50
-        int[] warpcloth:pins = [2]
-    }}
-    def Mesh "Chair"
-    {{
-        int[] faceVertexCounts = [3]
-        int[] faceVertexIndices = [0, 2, 1]
-        point3f[] points = [(0, -100, 0), (100, -100, 0), (0, -100, 100)]
-    }}
-}}
-"""
+
+def cloth(name, counts, corners, points, density, stiffness, pins, *more):
+    mesh = f"int[] faceVertexCounts = {counts}\nint[] faceVertexIndices = {corners}\npoint3f[] points = {points}"
+    spring = f'token warpcloth:terms:threads:type = "Spring"\ndouble warpcloth:terms:threads:stiffness = {stiffness}'
+    return prim("Mesh", name, mesh, f"double warpcloth:density = {density}\nint[] warpcloth:pins = {pins}", spring, *more)
 
 
 def written(folder, more=""):
+    """A stage in cm of a figure with a skirt, a belt 15 cm above it and a chair, which is no cloth."""
+    facts = "double warpcloth:duration = 0.1\ndouble warpcloth:selfContact:distance = 0.002"
+    raised = 'double3 xformOp:translate = (0, 5, 0)\nuniform token[] xformOpOrder = ["xformOp:translate"]'
+    belt = [(0, 10, 0), (100, 10, 0), (0, 10, 100), (90, 10, 100)]
+    chair = "int[] faceVertexCounts = [3]\nint[] faceVertexIndices = [0, 2, 1]\npoint3f[] points = "
+    prims = [
+        cloth("Skirt", [4], [0, 2, 3, 1], QUAD, 0.4, 1000, [0, 1], facts),
+        cloth("Belt", [3, 3], [0, 2, 1, 1, 2, 3], belt, 0.05, 50, [2], raised, more),
+        prim("Mesh", "Chair", f"{chair}[(0, -100, 0), (100, -100, 0), (0, -100, 100)]"),
+    ]
+    head = '#usda 1.0\n(\nmetersPerUnit = 0.01\nupAxis = "Y"\ntimeCodesPerSecond = 60\n)\n'
     path = folder / "figure.usda"
-    path.write_text(STAGE.format(more=more))
+    path.write_text(head + prim("Xform", "Figure", *prims))
     return path
 
 

@@ -1,7 +1,5 @@
 """Colliders of stages that artists make: shapes, scales, motion, materials, and what cannot be one."""
 
-import warnings
-
 import numpy as np
 import pytest
 import trimesh
@@ -50,20 +48,23 @@ def shape(kind, text="", name="Thing", meta=COLLIDES):
 
 
 def ops(**operations):
-    """Transforms, in the order given: (type, value or time samples)."""
-    lines = [f"{type_name} xformOp:{name}{value}" for name, (type_name, value) in operations.items()]
+    """Transforms in the order given, each a value or time samples as a dictionary."""
+    types = {"translate": "double3", "scale": "float3"}
+    values = {name: f"{'.timeSamples' if isinstance(x, dict) else ''} = {x}" for name, x in operations.items()}
+    lines = [f"{types.get(name, 'float')} xformOp:{name}{text}" for name, text in values.items()]
     order = ", ".join(f'"xformOp:{name}"' for name in operations)
-    return "\n".join([*lines, f"uniform token[] xformOpOrder = [{order}]"])
+    return "\n".join([*lines, f"uniform token[] xformOpOrder = [{order}]\n"])
 
 
 def at(x, y, z):
-    return ops(translate=("double3", f" = ({x}, {y}, {z})"))
+    return ops(translate=(x, y, z))
 
 
-MOVING = ops(
-    translate=("double3", ".timeSamples = {101: (0, 0, 0), 105: (40, 0, 0)}"),
-    rotateZ=("float", ".timeSamples = {101: 0, 105: 80}"),
-)
+def scaled(scale):
+    return ops(scale=scale)
+
+
+MOVING = ops(translate={101: (0, 0, 0), 105: (40, 0, 0)}, rotateZ={101: 0, 105: 80})
 
 
 def scene_with(path, *texts):
@@ -93,12 +94,8 @@ def test_solids_in_units_of_the_stage(path):
     texts = [
         shape("Sphere", "double radius = 20\n" + at(50, 0, 30)),
         shape("Capsule", 'double radius = 5\ndouble height = 40\nuniform token axis = "X"\n' + at(0, 0, 9), "Rod"),
-        shape("Cube", "double size = 2\n" + ops(rotateZ=("float", " = 90"), scale=("float3", " = (10, 20, -30)")), "Brick"),
-        shape(
-            "Plane",
-            'uniform token axis = "X"\n' + ops(translate=("double3", " = (0, -200, 0)"), rotateZ=("float", " = 90")),
-            "Wall",
-        ),
+        shape("Cube", "double size = 2\n" + ops(rotateZ=90, scale=(10, 20, -30)), "Brick"),
+        shape("Plane", 'uniform token axis = "X"\n' + ops(translate=(0, -200, 0), rotateZ=90), "Wall"),
     ]
     ball, rod, brick, wall = scene_with(path, *texts).colliders
     assert [each.name for each in (ball, rod, brick, wall)] == ["/Thing", "/Rod", "/Brick", "/Wall"]
@@ -112,50 +109,31 @@ def test_solids_in_units_of_the_stage(path):
 
 @pytest.mark.parametrize(("sign", "height", "side"), [((1, 1, 1), 0, 1), ((-1, 1, 1), 0, 1), ((1, 1, -1), 300, -1)])
 def test_a_mirrored_plane_keeps_what_is_behind_it(path, sign, height, side):
-    text = ops(translate=("double3", f" = (0, 0, {height})"), scale=("float3", f" = {sign}"))
-    plane = collider_of(path, shape("Plane", 'uniform token axis = "Z"\n' + text))
+    plane = collider_of(path, shape("Plane", 'uniform token axis = "Z"\n' + ops(translate=(0, 0, height), scale=sign)))
     assert isinstance(plane, wc.Plane)
     np.testing.assert_allclose(plane.distances(np.array([[0.3, 0.2, 0.1]])), [(0.1 - 0.01 * height) * side])
 
 
-@pytest.mark.parametrize(
-    ("kind", "size", "volume"),
-    [
-        ("Sphere", "double radius = 10\n" + ops(scale=("float3", " = (1, 2, 3)")), 4 / 3 * np.pi * 6e-3),
-        ("Sphere", "double radius = 10\n" + ops(scale=("float3", " = (-1, 2, 3)")), 4 / 3 * np.pi * 6e-3),
-        ("Cylinder", 'double radius = 10\ndouble height = 20\nuniform token axis = "X"', np.pi * 2e-3),
-        ("Cone", 'double radius = 10\ndouble height = 30\nuniform token axis = "Y"', np.pi * 1e-3),
-        ("Mesh", TETRAHEDRON, 1e-3 / 6),
-        (
-            "Mesh",
-            TETRAHEDRON.replace("[3, 3, 3, 3]", "[4, 3, 3, 4]")
-            .replace("0, 2, 1, 0", "0, 2, 4, 1, 0")
-            .replace("2, 1, 2, 3", "2, 1, 4, 2, 3")
-            .replace("10)]", "10), (5, 5, 0)]"),
-            1e-3 / 6,
-        ),
-        (
-            "Mesh",
-            TETRAHEDRON.replace("[3, 3, 3, 3]", "[3, 3, 3, 3, 3]")
-            .replace("2, 1, 2, 3", "2, 1, 4, 3, 2, 1, 4")
-            .replace("10)]", "10), (0, 10, 0)]"),
-            1e-3 / 6,
-        ),
-        ("Mesh", 'uniform token orientation = "leftHanded"\n' + INWARD, 1e-3 / 6),
-        ("Mesh", ops(scale=("float3", " = (2, -3, 1)")) + TETRAHEDRON, 1e-3),
-    ],
-    ids=[
-        "ellipsoid",
-        "mirrored ellipsoid",
-        "cylinder",
-        "cone",
-        "mesh",
-        "corners on a line",
-        "corners at one position",
-        "left-handed",
-        "mirrored mesh",
-    ],
-)
+ON_A_LINE = TETRAHEDRON.replace("[3, 3, 3, 3]", "[4, 3, 3, 4]").replace("0, 2, 1, 0", "0, 2, 4, 1, 0")
+AT_ONE_POSITION = TETRAHEDRON.replace("[3, 3, 3, 3]", "[3, 3, 3, 3, 3]").replace("2, 1, 2, 3", "2, 1, 4, 3, 2, 1, 4")
+SOLIDS = {
+    "ellipsoid": ("Sphere", "double radius = 10\n" + scaled((1, 2, 3)), 4 / 3 * np.pi * 6e-3),
+    "mirrored ellipsoid": ("Sphere", "double radius = 10\n" + scaled((-1, 2, 3)), 4 / 3 * np.pi * 6e-3),
+    "cylinder": ("Cylinder", 'double radius = 10\ndouble height = 20\nuniform token axis = "X"', np.pi * 2e-3),
+    "cone": ("Cone", 'double radius = 10\ndouble height = 30\nuniform token axis = "Y"', np.pi * 1e-3),
+    "mesh": ("Mesh", TETRAHEDRON, 1e-3 / 6),
+    "corners on a line": (
+        "Mesh",
+        ON_A_LINE.replace("2, 1, 2, 3", "2, 1, 4, 2, 3").replace("10)]", "10), (5, 5, 0)]"),
+        1e-3 / 6,
+    ),
+    "corners at one position": ("Mesh", AT_ONE_POSITION.replace("10)]", "10), (0, 10, 0)]"), 1e-3 / 6),
+    "left-handed": ("Mesh", 'uniform token orientation = "leftHanded"\n' + INWARD, 1e-3 / 6),
+    "mirrored mesh": ("Mesh", scaled((2, -3, 1)) + TETRAHEDRON, 1e-3),
+}
+
+
+@pytest.mark.parametrize(("kind", "size", "volume"), SOLIDS.values(), ids=SOLIDS)
 def test_other_solids_are_meshes_with_their_fronts_outside(path, kind, size, volume):
     """The volume by the divergence theorem, which is negative if the front is inside; 1 % for the facets."""
     mesh = collider_of(path, shape(kind, size))
@@ -165,15 +143,12 @@ def test_other_solids_are_meshes_with_their_fronts_outside(path, kind, size, vol
     assert found == pytest.approx(volume, rel=1e-2)
 
 
-@pytest.mark.parametrize(
-    ("kind", "text"),
-    [("Sphere", "double radius = 10"), ("Mesh", TETRAHEDRON), ("Plane", 'uniform token axis = "Z"')],
-    ids=["Sphere", "Mesh", "Plane"],
-)
-def test_colliders_follow_the_transforms_above_them(path, kind, text):
+@pytest.mark.parametrize("kind", ["Sphere", "Mesh", "Plane"])
+def test_colliders_follow_the_transforms_above_them(path, kind):
     """10 cm along x and 20° about z a frame, also of a shape that is turned below them."""
-    below = ops(translate=("double3", " = (0, -20, 0)"), rotateX=("float", " = -90"))
-    found = collider_of(path, f'def Xform "Parent"\n{{\n{MOVING}\n{shape(kind, below + chr(10) + text)}}}\n')
+    text = {"Sphere": "double radius = 10", "Mesh": TETRAHEDRON, "Plane": 'uniform token axis = "Z"'}[kind]
+    below = ops(translate=(0, -20, 0), rotateX=-90)
+    found = collider_of(path, f'def Xform "Parent"\n{{\n{MOVING}\n{shape(kind, below + text)}}}\n')
     assert found.moves and found.poses.shape == (5, 7)
     for frame in range(5):
         angle = np.radians(20.0 * frame)
@@ -187,22 +162,16 @@ def test_colliders_follow_the_transforms_above_them(path, kind, text):
             np.testing.assert_allclose(turned(found, frame, found.points[[1]]), [at_frame + along], atol=1e-7)
     if kind == "Mesh":
         assert found.points.shape == (4, 3)  # a body, which is not stored at each frame
-
-
-def test_motion_is_read_until_a_frame_after_the_last(path):
-    """So that steps up to the last frame are computed as with all of it."""
-    text = ops(translate=("double3", ".timeSamples = {101: (0, 0, 0), 111: (100, 0, 0)}"))
+    # Motion is read until a frame after the last, so that steps up to the last frame are computed as with all of it.
+    text = ops(translate={101: (0, 0, 0), 111: (100, 0, 0)})
     np.testing.assert_allclose(collider_of(path, shape("Sphere", text)).poses[:, 0], 0.1 * np.arange(6))
 
 
+RISING = TETRAHEDRON.replace("points =", "points.timeSamples = {101:").rstrip()
 DEFORMING = {
-    "scale": ("Cube", "double size = 20\n" + ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 105: (1, 1, 3)}"))),
+    "scale": ("Cube", "double size = 20\n" + scaled({101: (1, 1, 1), 105: (1, 1, 3)})),
     "size": ("Cube", "double size.timeSamples = {101: 20, 105: 60}"),
-    "points": (
-        "Mesh",
-        TETRAHEDRON.replace("points =", "points.timeSamples = {101:").rstrip()
-        + ", 105: [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 30)]}",
-    ),
+    "points": ("Mesh", RISING + ", 105: [(0, 0, 0), (10, 0, 0), (0, 10, 0), (0, 0, 30)]}"),
 }
 
 
@@ -217,9 +186,8 @@ def test_shapes_that_change_are_meshes_that_deform(path, case):
 @pytest.mark.parametrize("scale", ((1, 1, 1), (-1, 1, 1)))
 def test_a_scale_of_0_hides_a_shape(path, scale):
     """It is a point then, at its position; at other frames its fronts look outwards."""
-    samples = f"101: (0, 0, 0), 102: (0, 0, 0), 103: {scale}, 104: {scale}, 105: (0, 0, 0)"
-    scaled = ("float3", f".timeSamples = {{{samples}}}")
-    found = collider_of(path, shape("Cube", ops(translate=("double3", " = (0, 0, 100)"), scale=scaled)))
+    samples = {101: (0, 0, 0), 102: (0, 0, 0), 103: scale, 104: scale, 105: (0, 0, 0)}
+    found = collider_of(path, shape("Cube", ops(translate=(0, 0, 100), scale=samples)))
     sizes = [0.0, 0.0, 0.02, 0.02, 0.0]
     assert found.closed
     np.testing.assert_allclose(np.ptp(found.frames, axis=1), np.outer(sizes, np.ones(3)), atol=1e-9)
@@ -228,106 +196,77 @@ def test_a_scale_of_0_hides_a_shape(path, scale):
         np.testing.assert_allclose(found.distances(points, frame), [-size / 2, 0.03 - size / 2], atol=1e-7)
 
 
-APPROXIMATED = {
-    "none": (wc.MeshCollider, 0),
-    "convexHull": (wc.MeshCollider, 0),
-    "boundingCube": (wc.Box, 0),
-    "boundingSphere": (wc.Sphere, 0),
-    "convexDecomposition": (wc.MeshCollider, 1),
-    "meshSimplification": (wc.MeshCollider, 1),
-    "sdf": (wc.MeshCollider, 1),
-}
+APPROXIMATED = dict.fromkeys(("none", "convexHull"), wc.MeshCollider) | {"boundingCube": wc.Box, "boundingSphere": wc.Sphere}
+APPROXIMATED |= dict.fromkeys(("convexDecomposition", "meshSimplification", "sdf"))  # which are said to be taken as none
 
 
 @pytest.mark.parametrize("by", ["physics", "own"])
-@pytest.mark.parametrize("approximation", APPROXIMATED)
-def test_approximations_of_a_mesh(path, approximation, by):
-    kind, said = APPROXIMATED[approximation]
+@pytest.mark.parametrize(("approximation", "kind"), APPROXIMATED.items(), ids=APPROXIMATED)
+def test_approximations_of_a_mesh(path, approximation, kind, by, recwarn):
     own = f'string warpcloth:collider = "{approximation}"'
     api = f'uniform token physics:approximation = "{approximation}"'
     text, meta = (own, "") if by == "own" else (api, COLLIDES.replace('API"', 'API", "PhysicsMeshCollisionAPI"'))
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        found = collider_of(path, shape("Mesh", text + "\n" + at(100, 0, 0) + TETRAHEDRON, meta=meta))
-    assert isinstance(found, kind)
+    found = collider_of(path, shape("Mesh", text + "\n" + at(100, 0, 0) + TETRAHEDRON, meta=meta))
+    assert isinstance(found, kind or wc.MeshCollider)
     words = f"{path}, prim /Thing: its approximation {approximation} is taken as none"
-    assert [str(each.message).startswith(words) for each in warned] == [True] * said
+    assert [str(each.message).startswith(words) for each in recwarn] == [True] * (kind is None)
     distances = found.distances(np.array([[1.0, 0, 0], [1.1, 0, 0], [1, 0.1, 0], [1, 0, 0.1]]))
     np.testing.assert_allclose(distances, 0.0, atol=1e-7)  # the corners are on each of them
 
 
-def test_a_mesh_that_faces_inwards_is_said(path):
-    """All but its inside is solid then: a cloth in a closed room."""
-    room = shape("Mesh", ops(translate=("double3", " = (-500, -500, -500)"), scale=("float3", " = (500, 500, 500)")) + INWARD)
+def test_meshes_that_face_inwards_or_are_flat(path):
+    """All but its inside is solid then: a cloth in a closed room. A mesh that is a collider is not the cloth."""
+    room = ops(translate=(-500, -500, -500), scale=(500, 500, 500)) + INWARD
     with pytest.warns(UserWarning, match="prim /Thing: its triangles face inwards, so that what they enclose is free"):
-        assert collider_of(path, room).closed
-
-
-def test_a_flat_mesh_has_a_sphere_about_it(path):
+        assert collider_of(path, shape("Mesh", room)).closed
     flat = TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)")
     ball = collider_of(path, shape("Mesh", 'token warpcloth:collider = "boundingSphere"' + flat))
     np.testing.assert_allclose([ball.radius, *ball.position], [0.1 * np.sqrt(0.5), 0.05, 0.05, 0], atol=1e-6)
-
-
-def test_a_mesh_that_is_a_collider_is_not_the_cloth(path):
-    collider_of(path, shape("Mesh", TETRAHEDRON))
     assert read_stage_mesh(path).prim == "/Cloth"
 
 
-MATERIAL = """
-def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])
-{{
-    {}
-}}
-"""
-BOUND = "rel material:binding:physics = </Rubber>"
-
-
 @pytest.mark.parametrize(
-    ("material", "own", "friction", "said"),
+    ("sliding", "static", "own", "friction", "said"),
     [
-        ("", "", 0.0, 0),
-        ("float physics:dynamicFriction = 0.25", "", 0.25, 0),
-        ("float physics:staticFriction = 0.5", "", 0.5, 0),
-        ("float physics:dynamicFriction = 0.25\nfloat physics:staticFriction = 0.5", "", 0.25, 1),
-        ("float physics:dynamicFriction = 0.5\nfloat physics:staticFriction = 0.5", "", 0.5, 0),
-        ("float physics:dynamicFriction = 0\nfloat physics:staticFriction = 0.5", "", 0.0, 1),
-        ("float physics:dynamicFriction = 0.25\nfloat physics:staticFriction = 0.5", "double warpcloth:friction = 0.3", 0.3, 0),
+        (None, None, None, 0.0, 0),
+        (0.25, None, None, 0.25, 0),
+        (None, 0.5, None, 0.5, 0),
+        (0.25, 0.5, None, 0.25, 1),
+        (0.5, 0.5, None, 0.5, 0),
+        (0, 0.5, None, 0.0, 1),
+        (0.25, 0.5, 0.3, 0.3, 0),
     ],
 )
-def test_friction(path, material, own, friction, said):
+def test_friction(path, sliding, static, own, friction, said, recwarn):
     """That of sliding, because a collider has one coefficient; ours first."""
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        found = collider_of(
-            path,
-            MATERIAL.format(material),
-            shape("Sphere", f"{BOUND}\n{own}", meta=COLLIDES.replace('API"', 'API", "MaterialBindingAPI"')),
-        )
-    assert found.friction == friction
-    assert ["its static friction 0.5 is not read" in str(each.message) for each in warned] == [True] * said
+    names = {"float physics:dynamicFriction": sliding, "float physics:staticFriction": static}
+    text = "\n".join(f"{name} = {value}" for name, value in names.items() if value is not None)
+    material = f'def Material "Rubber" (prepend apiSchemas = ["PhysicsMaterialAPI"])\n{{\n{text}\n}}\n'
+    text = "rel material:binding:physics = </Rubber>" + (f"\ndouble warpcloth:friction = {own}" if own else "")
+    meta = COLLIDES.replace('API"', 'API", "MaterialBindingAPI"')
+    assert collider_of(path, material, shape("Sphere", text, meta=meta)).friction == friction
+    assert ["its static friction 0.5 is not read" in str(each.message) for each in recwarn] == [True] * said
 
 
-@pytest.mark.parametrize(
-    ("api", "said"),
-    [
-        ("bool physics:kinematicEnabled = 1", 0),
-        ("bool physics:kinematicEnabled = 0", 1),
-        ("bool physics:rigidBodyEnabled = 0", 0),
-    ],
-)
-def test_a_rigid_body_that_forces_would_move_is_said(path, api, said):
-    body = f'def Xform "Body" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])\n{{\n{api}\n{MOVING}\n{shape("Sphere")}}}\n'
-    with warnings.catch_warnings(record=True) as warned:
-        warnings.simplefilter("always")
-        assert collider_of(path, body).moves
-    assert ["prim /Body/Thing: is a rigid body that is not kinematic" in str(each.message) for each in warned] == [True] * said
+@pytest.mark.parametrize(("name", "value", "said"), [("kinematic", 1, 0), ("kinematic", 0, 1), ("rigidBody", 0, 0)])
+def test_a_rigid_body_that_forces_would_move_is_said(path, name, value, said, recwarn):
+    text = f"bool physics:{name}Enabled = {value}\n{MOVING}\n{shape('Sphere')}"
+    assert collider_of(path, f'def Xform "Body" (prepend apiSchemas = ["PhysicsRigidBodyAPI"])\n{{\n{text}}}\n').moves
+    assert ["prim /Body/Thing: is a rigid body that is not kinematic" in str(each.message) for each in recwarn] == [True] * said
 
 
-MARKED = "bool warpcloth:collider = {}"
+MARKED, BALL = "bool warpcloth:collider = {}", shape("Sphere", meta="")
+
+
+def marked(*texts):
+    """An object that is marked, with what is below it."""
+    return shape("Xform", MARKED.format(1) + "\n" + "".join(texts), "Object", "")
+
+
+INSTANCE = "(instanceable = true\nprepend references = </Proto>)"
 CHOSEN = {
     "a shape": (shape("Sphere"), 1),
-    "without the mark": (shape("Sphere", meta=""), 0),
+    "without the mark": (BALL, 0),
     "turned off": (shape("Sphere", "bool physics:collisionEnabled = 0"), 0),
     "a mesh that is turned off": (
         shape("Mesh", MARKED.format(0) + "\ndouble warpcloth:friction = 1" + TETRAHEDRON, meta=""),
@@ -335,128 +274,92 @@ CHOSEN = {
     ),
     "our mark": (shape("Sphere", MARKED.format(1), meta=""), 1),
     "our mark first": (shape("Sphere", MARKED.format(0)), 0),
-    "the mark of an object": (shape("Xform", MARKED.format(1) + "\n" + shape("Sphere", meta=""), "Object", ""), 1),
-    "a sample, as of a moving object": (
-        shape("Xform", "bool warpcloth:collider.timeSamples = {1: 1}\n" + shape("Sphere", meta=""), "Object", ""),
-        1,
-    ),
-    "a shape that is not its object": (
-        shape(
-            "Xform",
-            MARKED.format(1) + "\n" + shape("Sphere", MARKED.format(0), meta="") + shape("Cube", "", "Other", ""),
-            "Object",
-            "",
-        ),
-        1,
-    ),
-    "no child of it": (
-        shape(
-            "Xform",
-            MARKED.format(1) + "\n" + shape("Sphere", meta="") + shape("Xform", shape("Cube", meta=""), "Child", ""),
-            "Object",
-            "",
-        ),
-        1,
-    ),
+    "the mark of an object": (marked(BALL), 1),
+    "a sample, as of a moving object": (marked(BALL).replace(" = 1", ".timeSamples = {1: 1}"), 1),
+    "a shape that is not its object": (marked(shape("Sphere", MARKED.format(0), meta=""), shape("Cube", "", "Other", "")), 1),
+    "no child of it": (marked(BALL, shape("Xform", shape("Cube", meta=""), "Child", "")), 1),
     "invisible": (shape("Sphere", 'token visibility = "invisible"\nuniform token purpose = "guide"'), 1),
     "inactive": (shape("Sphere", meta=COLLIDES.replace("(", "(active = false\n")), 0),
     "over": (shape("Sphere").replace("def", "over"), 0),
     "class": (shape("Sphere").replace("def", "class"), 0),
     "instance": (
         shape("Xform", shape("Sphere"), "Proto", "").replace("def", "class", 1)
-        + shape("", name="One", meta="(instanceable = true\nprepend references = </Proto>)")
-        + shape("", name="Two", meta="(instanceable = true\nprepend references = </Proto>)"),
+        + shape("", name="One", meta=INSTANCE)
+        + shape("", name="Two", meta=INSTANCE),
         2,
     ),
 }
 
 
-@pytest.mark.parametrize("case", CHOSEN)
-def test_which_prims_are_colliders(path, case):
-    text, count = CHOSEN[case]
+@pytest.mark.parametrize(("text", "count"), CHOSEN.values(), ids=CHOSEN)
+def test_which_prims_are_colliders(path, text, count):
     assert len(scene_with(path, text).colliders) == count
 
 
-REFUSED = {
-    "points": (
-        shape("Points", "point3f[] points = [(0, 0, 0)]"),
-        "prim /Thing: is Points, must be a Mesh or one of Cube, Sphere",
+REFUSED = [  # kind and text of the shape, message about it
+    ("Points", "point3f[] points = [(0, 0, 0)]", "is Points, must be a Mesh or one of Cube, Sphere"),
+    ("Xform", "", "is Xform without a shape right below it, must be a shape to be a collider"),
+    ("Scope", shape("Sphere", name="Ball", meta=""), "is Scope without a shape right below it, must be"),
+    ("Sphere", scaled((1, 0, 1)), "the transform to world space is .*invertible"),
+    (
+        "Sphere",
+        scaled({101: (1, 1, 1), 103: (0, 0, 1)}),
+        "time code 103: the transform to world space is .*, must be invertible",
     ),
-    "empty": (shape("Xform"), "prim /Thing: is Xform without a shape right below it, must be a shape to be a collider"),
-    "scope": (
-        shape("Scope", shape("Sphere", name="Ball", meta="")),
-        "prim /Thing: is Scope without a shape right below it, must be",
+    (
+        "Sphere",
+        scaled({101: (0, 0, 0), 105: (0, 0, 0)}),
+        "is scaled to 0 at all frames, must be larger at some or be turned off with warpcloth:collider",
     ),
-    "instancer": (
-        shape("PointInstancer", shape("Sphere"), "Many", ""),
-        "prim /Many: has a collider as a prototype, which must be",
+    ("Sphere", "double radius = 0", "radius is 0.0, must be above 0"),
+    ("Plane", scaled({101: (1, 1, 1), 105: (2, 1, 1)}), "is a Plane whose scale changes over time, must keep it"),
+    ("Mesh", "", "has no points"),
+    ("Mesh", "point3f[] points = [(0, 0, 0)]", "has no faces"),
+    ("Mesh", TETRAHEDRON.replace("10", "0"), "has no triangle with an area, must have one to be a collider"),
+    (
+        "Mesh",
+        'token warpcloth:collider = "convexHull"' + TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)"),
+        "its points are in a plane, must have a volume for a convexHull",
     ),
-    "flat": (
-        shape("Sphere", ops(scale=("float3", " = (1, 0, 1)"))),
-        "prim /Thing: the transform to world space is .*invertible",
+    (
+        "Mesh",
+        TETRAHEDRON + "point3f[] points.timeSamples = {101: [(0, 0, 0)], 102: [(0, 0, 0), (1, 1, 1)]}",
+        "points has 2 points at time code 102, must keep 1",
     ),
-    "flat later": (
-        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 103: (0, 0, 1)}"))),
-        "prim /Thing: time code 103: the transform to world space is .*, must be invertible",
+    (
+        "Mesh",
+        'token warpcloth:collider = "round"' + TETRAHEDRON,
+        "warpcloth:collider is 'round', must be true, false or one of none, boundingCube, boundingSph",
     ),
-    "zero scale": (
-        shape("Sphere", ops(scale=("float3", ".timeSamples = {101: (0, 0, 0), 105: (0, 0, 0)}"))),
-        "prim /Thing: is scaled to 0 at all frames, must be larger at some or be turned off with warpcloth:collider",
+    ("Sphere", 'string warpcloth:collider = "false"', "warpcloth:collider is 'false', must be true, false or"),
+    ("Sphere", "double3 warpcloth:collider = (1, 0, 0)", "warpcloth:collider has type double3, must be bool or token"),
+    (
+        "Sphere",
+        "bool physics:collisionEnabled.timeSamples = {101: 0, 103: 1}",
+        "physics:collisionEnabled changes over time, must have one value",
     ),
-    "radius": (shape("Sphere", "double radius = 0"), "prim /Thing: radius is 0.0, must be above 0"),
-    "swelling plane": (
-        shape("Plane", ops(scale=("float3", ".timeSamples = {101: (1, 1, 1), 105: (2, 1, 1)}"))),
-        "prim /Thing: is a Plane whose scale changes over time, must keep it",
+    (
+        "Sphere",
+        "double warpcloth:fricton = 1",
+        "warpcloth:fricton is no attribute of a collider, must be one of warpcloth:collider, .*warpcloth:friction",
     ),
-    "no points": (shape("Mesh"), "prim /Thing: has no points"),
-    "no faces": (shape("Mesh", "point3f[] points = [(0, 0, 0)]"), "prim /Thing: has no faces"),
-    "no area": (
-        shape("Mesh", TETRAHEDRON.replace("10", "0")),
-        "prim /Thing: has no triangle with an area, must have one to be a collider",
-    ),
-    "flat hull": (
-        shape("Mesh", 'token warpcloth:collider = "convexHull"' + TETRAHEDRON.replace("(0, 0, 10)", "(10, 10, 0)")),
-        "prim /Thing: its points are in a plane, must have a volume for a convexHull",
-    ),
-    "count": (
-        shape("Mesh", TETRAHEDRON + "point3f[] points.timeSamples = {101: [(0, 0, 0)], 102: [(0, 0, 0), (1, 1, 1)]}"),
-        "prim /Thing: points has 2 points at time code 102, must keep 1",
-    ),
-    "approximation": (
-        shape("Mesh", 'token warpcloth:collider = "round"' + TETRAHEDRON),
-        "prim /Thing: warpcloth:collider is 'round', must be true, false or one of none, boundingCube, boundingSph",
-    ),
-    "text": (
-        shape("Sphere", 'string warpcloth:collider = "false"', meta=""),
-        "warpcloth:collider is 'false', must be true, false or",
-    ),
-    "type": (shape("Sphere", "double3 warpcloth:collider = (1, 0, 0)", meta=""), "has type double3, must be bool or token"),
-    "for a while": (
-        shape("Sphere", "bool physics:collisionEnabled.timeSamples = {101: 0, 103: 1}"),
-        "prim /Thing: physics:collisionEnabled changes over time, must have one value",
-    ),
-    "attribute": (
-        shape("Sphere", "double warpcloth:fricton = 1"),
-        "prim /Thing: warpcloth:fricton is no attribute of a collider, must be one of warpcloth:collider, .*warpcloth:friction",
-    ),
-    "friction": (shape("Sphere", "double warpcloth:friction = -1"), "prim /Thing: /Thing.friction is -1.0; it must be"),
-    "inside": (
-        shape("Sphere", "double radius = 90\n" + at(0, 0, 200)),
-        "prim /Cloth: vertex 0 starts 0.9 m inside the collider /Thing",
-    ),
-    "payload": (
-        'def Sphere "Thing" (prepend apiSchemas = ["PhysicsCollisionAPI"]\nprepend payload = @./missing.usda@)\n{\n}\n',
-        "prim /Thing: .*missing.usda.* must be there",
-    ),
-}
+    ("Sphere", "double warpcloth:friction = -1", "/Thing.friction is -1.0; it must be"),
+]
+INSIDE = shape("Sphere", "double radius = 90\n" + at(0, 0, 200))
+REFUSED_TEXTS = [(shape(kind, text), f"prim /Thing: {message}") for kind, text, message in REFUSED]
+GONE = COLLIDES.replace(")", "\nprepend payload = @./gone.usda@)")
+REFUSED_TEXTS += [
+    (shape("PointInstancer", shape("Sphere"), "Many", ""), "prim /Many: has a collider as a prototype, which must be"),
+    (INSIDE, "prim /Cloth: vertex 0 starts 0.9 m inside the collider /Thing"),
+    (shape("Sphere", meta=GONE), "prim /Thing: .*gone.usda.* must be there"),
+]
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_a_collider_is_refused_with_its_path(path, case):
-    text, message = REFUSED[case]
+@pytest.mark.parametrize(("text", "message"), REFUSED_TEXTS, ids=[message[:60] for _, message in REFUSED_TEXTS])
+def test_what_cannot_be_a_collider_is_refused_with_its_path(path, text, message):
     with pytest.raises(ValueError, match=message) as caught:
         scene_with(path, text)
-    assert str(caught.value).count(str(path)) == 1 + (case == "payload") and "\n" not in str(caught.value)
+    assert str(caught.value).count(str(path)) == 1 + ("payload" in text) and "\n" not in str(caught.value)
 
 
 def test_a_scene_with_colliders_runs_from_its_stage_to_the_same_bits(device, tmp_path):

@@ -80,16 +80,22 @@ def test_a_scene_is_the_same_with_the_names_and_close_by_the_names_alone(tmp_pat
         np.testing.assert_allclose(bending.stiffness * lengths, bending.stiffness[0] * lengths[0], rtol=4 * EPS)
 
 
+def physics(**values):
+    return {f"physics:{name}": ("Float", value) for name, value in values.items()}
+
+
 # In cm and g: E = 1000 g/(cm·s²) = 100 Pa, t = 1 cm, so that Et = 1 N/m.
-SOLID = {"physics:youngsModulus": ("Float", 1000.0), "physics:surfaceThickness": ("Float", 1.0)}
+SOLID = {"youngsModulus": 1000.0, "surfaceThickness": 1.0}
+SHORT = {"stretch": "surfaceStretchStiffness", "shear": "surfaceShearStiffness", "ratio": "poissonsRatio"}
+SHORT |= {"bend": "surfaceBendStiffness"}
 
 
 @pytest.mark.parametrize(
     ("names", "law", "expected"),
     [
         (SOLID, "proposal", [(1.0, 0.3, None), 1e-4 / 12 / 0.91]),
-        (SOLID | {"physics:poissonsRatio": ("Float", 0.0)}, "proposal", [(1.0, 0.0, None), 1e-4 / 12]),
-        (SOLID | {"physics:poissonsRatio": ("Float", 0.0)}, "newton", [(2.0, 0.0, None), None]),
+        (SOLID | {"ratio": 0.0}, "proposal", [(1.0, 0.0, None), 1e-4 / 12]),
+        (SOLID | {"ratio": 0.0}, "newton", [(2.0, 0.0, None), None]),
         # K = 1 N/m and G = 0.375 N/m: ν = 1 − 2G/K = 0.25; with another ν, warp and weft and a shear of their own.
         ({"stretch": 1000.0, "shear": 375.0}, "proposal", [(0.9375, 0.25, None)]),
         ({"stretch": 1000.0, "shear": 375.0, "ratio": 0.25}, "proposal", [(0.9375, 0.25, None)]),
@@ -100,27 +106,21 @@ SOLID = {"physics:youngsModulus": ("Float", 1000.0), "physics:surfaceThickness":
     ],
 )
 def test_moduli_of_a_material_become_terms(tmp_path, names, law, expected):
-    short = {"stretch": "surfaceStretchStiffness", "shear": "surfaceShearStiffness", "ratio": "poissonsRatio"}
-    short = {key: f"physics:{value}" for key, value in (short | {"bend": "surfaceBendStiffness"}).items()}
     path = alone(write_scene(declared(), tmp_path / "names.usda", law="proposal"))
     stage = Usd.Stage.Open(path)
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.GetPseudoRoot().SetMetadata("kilogramsPerUnit", 0.001)
     material = stage.GetPrimAtPath("/World/Looks/ClothPhysics")
-    for name in (*short.values(), "physics:density"):
-        material.RemoveProperty(name)
+    for name in (*SHORT.values(), "density"):
+        material.RemoveProperty(f"physics:{name}")
     stage.GetPrimAtPath("/World/Cloth").RemoveProperty("physics:thicknesses")
     stage.Save()
-    mass = {"physics:density": ("Float", 1.0)}
-    given = {short.get(name, name): value if isinstance(value, tuple) else ("Float", value) for name, value in names.items()}
-    found = read_scene(edited(path, "/World/Looks/ClothPhysics", mass | given), law=law).terms
+    given = physics(density=1.0, **{SHORT.get(name, name): value for name, value in names.items()})
+    found = read_scene(edited(path, "/World/Looks/ClothPhysics", given), law=law).terms
     assert len(found) == len(expected)
-    membrane = found[0]
-    values = membrane.stiffness, membrane.poisson_ratio, getattr(membrane, "shear_ratio", None)
-    assert values == (
-        *(pytest.approx(each, rel=4 * EPS, abs=4 * EPS) for each in expected[0][:2]),
-        expected[0][2] and pytest.approx(expected[0][2]),
-    )
+    membrane, (stiffness, ratio, shear) = found[0], expected[0]
+    assert (membrane.stiffness, membrane.poisson_ratio) == pytest.approx((stiffness, ratio), rel=4 * EPS, abs=4 * EPS)
+    assert getattr(membrane, "shear_ratio", None) == (shear and pytest.approx(shear))
     if len(expected) > 1 and expected[1] is not None:
         assert found[1].stiffness == pytest.approx(expected[1], rel=4 * EPS)
 
@@ -137,41 +137,31 @@ def test_attachments_to_a_prim_that_moves_are_keyframes(tmp_path):
     np.testing.assert_allclose(moved, np.array([0.0, 0.25, 0.5])[:, None, None] * [0.0, 0.0, 1.0] * np.ones((1, 2, 1)))
     edited(path, "/World/Pins/hard", {"physics:attachmentEnabled": ("Bool", False)})
     assert len(read_scene(path).pins.vertices) == 0
-
-
-def test_gravity_may_be_switched_off_as_in_newton(tmp_path):
-    path = alone(write_scene(declared(), tmp_path / "off.usda", law="newton"))
+    path = alone(write_scene(declared(), tmp_path / "off.usda", law="newton"))  # gravity may be switched off as in Newton
     assert not read_scene(edited(path, "/World/Physics", {"newton:gravityEnabled": ("Bool", False)})).gravity.any()
 
 
 @pytest.mark.parametrize(
-    ("prim", "names", "words"),
+    ("prim", "name", "type_name", "value", "words"),
     [
-        ("Pins/hard", {"physics:type0": ("Token", "face")}, r"the kind of points is 'face', must be 'point'"),
-        (
-            "Pins/hard",
-            {"physics:coords1": ("Point3fArray", [(0, 0, 0)])},
-            r"coords1 has 1 anchors, must have one for each of 2",
-        ),
-        ("Pins/hard", {"physics:coords1": ("Point3fArray", [(0, 0, 0)] * 2)}, r"an anchor 0\.6 m away from its point"),
-        ("Pins/hard", {"physics:indices0": ("IntArray", [0, 12])}, r"indices0\[1\] = 12, must be a point, 0 to 11"),
-        ("Cloth", {"physics:thicknesses": ("FloatArray", [1.0, 2.0])}, "must be one thickness of the whole cloth"),
-        ("Cloth", {"physics:restBendAngles": ("FloatArray", [1.0])}, "restBendAngles is given, must not be"),
-        (
-            "Cloth",
-            {"physics:masses": ("FloatArray", [1.0]), "physics:masses:elementType": ("Token", "point")},
-            "physics:masses has 1 values, must have 12",
-        ),
-        ("Looks/ClothPhysics", {"physics:surfaceStretchStiffness": ("Float", 0.0)}, "surfaceShearStiffness is given without"),
-        ("Cloth", {"newton:massModel": ("Token", "foo")}, "newton:massModel is 'foo', must be one of shell, solid"),
-        ("Cloth", {"physics:restBendAnglesDefault": ("Token", "bent")}, "restBendAnglesDefault is 'bent', must be one of flat"),
-        ("Looks/ClothPhysics", {"physics:poissonsRatio": ("Float", 1.0)}, "must be above -1 and below 1"),
+        ("Pins/hard", "physics:type0", "Token", "face", r"the kind of points is 'face', must be 'point'"),
+        ("Pins/hard", "physics:coords1", "Point3fArray", [(0, 0, 0)], "coords1 has 1 anchors, must have one for each of 2"),
+        ("Pins/hard", "physics:coords1", "Point3fArray", [(0, 0, 0)] * 2, r"an anchor 0\.6 m away from its point"),
+        ("Pins/hard", "physics:indices0", "IntArray", [0, 12], r"indices0\[1\] = 12, must be a point, 0 to 11"),
+        ("Cloth", "physics:thicknesses", "FloatArray", [1.0, 2.0], "must be one thickness of the whole cloth"),
+        ("Cloth", "physics:restBendAngles", "FloatArray", [1.0], "restBendAngles is given, must not be"),
+        ("Cloth", "physics:masses", "FloatArray", [1.0], "physics:masses has 1 values, must have 12"),
+        ("Looks/ClothPhysics", "physics:surfaceStretchStiffness", "Float", 0.0, "surfaceShearStiffness is given without"),
+        ("Cloth", "newton:massModel", "Token", "foo", "newton:massModel is 'foo', must be one of shell, solid"),
+        ("Cloth", "physics:restBendAnglesDefault", "Token", "bent", "restBendAnglesDefault is 'bent', must be one of flat"),
+        ("Looks/ClothPhysics", "physics:poissonsRatio", "Float", 1.0, "must be above -1 and below 1"),
     ],
 )
-def test_stages_that_cannot_be_a_scene_are_refused(tmp_path, prim, names, words):
+def test_stages_that_cannot_be_a_scene_are_refused(tmp_path, prim, name, type_name, value, words):
     path = alone(write_scene(declared(), tmp_path / "wrong.usda", law="proposal"))
+    kind = {"physics:masses:elementType": ("Token", "point")} if name == "physics:masses" else {}
     with pytest.raises(ValueError, match=words):
-        read_scene(edited(path, f"/World/{prim}", names))
+        read_scene(edited(path, f"/World/{prim}", {name: (type_name, value)} | kind))
 
 
 @pytest.mark.parametrize(
@@ -183,9 +173,8 @@ def test_stages_that_cannot_be_a_scene_are_refused(tmp_path, prim, names, words)
 )
 def test_a_doubtful_material_is_read_with_a_warning(tmp_path, names, words):
     path = alone(write_scene(declared(), tmp_path / "doubtful.usda", law="proposal"))
-    given = {f"physics:{name}": ("Float", value) for name, value in names.items()}
     with pytest.warns(UserWarning, match=f"doubtful.usda, prim /World/Cloth: .*{words}"):
-        read_scene(edited(path, "/World/Looks/ClothPhysics", given))
+        read_scene(edited(path, "/World/Looks/ClothPhysics", physics(**names)))
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,16 @@
 """Measures written over the stage that was measured, or on a stage of their own."""
 
 import os
-import random
 import re
-import resource
 import shutil
-import signal
-import sys
-import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from support.forks import Forks
+from support.disks import room_for
 from support.stages import (
     CHUNK,
     CODES,
@@ -22,9 +18,9 @@ from support.stages import (
     PENTAGON,
     PENTAGON_AND_TRIANGLE,
     animated_prim,
-    anonymous_memory,
     artist_stage,
     define_mesh,
+    full_from,
     measure,
     measured,
     net,
@@ -43,10 +39,6 @@ LEGEND = {"stretch1": {"low": 0.5, "neutral": 1.0, "high": np.float32(2.0), "uni
 
 def over_artist(folder):
     return read_stage_mesh(artist_stage(folder / "artist.usda", animated=True))
-
-
-def over_mirrored(folder):
-    return read_stage_mesh(artist_stage(folder / "artist.usda", sphere(), "leftHanded", (-1, 2, 1)))
 
 
 def over_moving(folder):
@@ -70,43 +62,30 @@ def over_result(folder):
     return read_stage_mesh(write(folder / "first.usda", Mesh.grid(5, 4)))
 
 
-def over_package(folder):
-    return read_stage_mesh(write(folder / "first.usdz", Mesh.grid(5, 4)))
-
-
 def over_net(folder):
     mesh, options = net(folder)
     return read_stage_mesh(write(folder / "net.usda", mesh, **options))
 
 
-def scene(folder):
-    return None
+CASES = {  # what makes the source in a folder, and endings of results, * for one file
+    "artist": (over_artist, "usda usdc* usdz*"),
+    "mirrored": (lambda folder: read_stage_mesh(artist_stage(folder / "a.usda", sphere(), "leftHanded", (-1, 2, 1))), "usdc"),
+    "moving": (over_moving, "usdc usda*"),
+    "result": (over_result, "usdc usdc*"),
+    "package": (lambda folder: read_stage_mesh(write(folder / "first.usdz", Mesh.grid(5, 4))), "usda"),
+    "net": (over_net, "usdc usdc*"),
+    "none": (lambda folder: None, "usda usd* usdz*"),
+}
 
 
-CASES = [
-    (over_artist, "usda", False),
-    (over_artist, "usdc", True),
-    (over_artist, "usdz", True),
-    (over_mirrored, "usdc", False),
-    (over_moving, "usdc", False),
-    (over_moving, "usda", True),
-    (over_result, "usdc", False),
-    (over_result, "usdc", True),
-    (over_package, "usda", False),
-    (over_net, "usdc", False),
-    (over_net, "usdc", True),
-    (scene, "usda", False),
-    (scene, "usd", True),
-    (scene, "usdz", True),
-]
-
-
-@pytest.fixture(scope="module", params=CASES, ids=lambda case: f"{case[0].__name__}-{case[1]}-{'one' if case[2] else 'chunks'}")
+@pytest.fixture(
+    scope="module", params=[f"{name} {ending}" for name, (_, endings) in CASES.items() for ending in endings.split()]
+)
 def result(request, tmp_path_factory):
     """Written measures: (path, mesh, source, bytes of the source before)."""
-    make, ending, single_file = request.param
-    folder = tmp_path_factory.mktemp("measures")
-    source = make(folder)
+    name, how = request.param.split()
+    folder, ending, single_file = tmp_path_factory.mktemp("measures"), how.strip("*"), how.endswith("*")
+    source = CASES[name][0](folder)
     mesh = source.mesh if source else Mesh.grid(5, 4)
     before = Path(source.path).read_bytes() if source else b""
     path = measure(folder / f"result.{ending}", mesh, source, single_file=single_file, metadata={"legend": LEGEND})
@@ -143,11 +122,6 @@ def test_colours_are_shown(result):
     material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
     reader = material.ComputeSurfaceSource()[0].GetInput("diffuseColor").GetConnectedSources()[0][0].source
     assert UsdShade.Shader(reader.GetPrim()).GetInput("varname").Get() == "displayColor"
-
-
-def test_passes_the_validators(result):
-    path, _, source, _ = result
-    assert validate(path, source and source.path) == []
 
 
 def test_the_source_is_as_it_was(result):
@@ -195,11 +169,12 @@ def test_nothing_but_measures_is_said_about_the_source(result):
     assert str(folder.parent) not in Sdf.Layer.FindOrOpen(path).ExportToString(), "paths of other files must be relative"
 
 
-def test_facts_survive(result):
-    path, _, _, _ = result
+def test_facts_survive_and_the_validators_pass(result):
+    path, _, source, _ = result
     _stage, prim = animated_prim(path)
     facts = Sdf.Layer.FindOrOpen(path).customLayerData["warpcloth"]
     assert facts == {"prim": str(prim.GetPath()), "legend": LEGEND}
+    assert validate(path, source and source.path) == []
 
 
 def test_directions_stand_in_the_world(result):
@@ -395,55 +370,44 @@ def test_edits_of_another_source_of_the_mesh_are_seen(tmp_path):
 # ----------------------------------------------------------------------------------------------------------- errors
 
 
-def with_another_neighbour(stage, mesh):
-    UsdGeom.Sphere.Define(stage, "/Sheet_axis")
-
-
-def with_another_child(stage, mesh):
-    UsdGeom.Scope.Define(stage, "/Sheet/DisplayColour")
-
-
 @pytest.mark.parametrize(
-    ("change", "options", "message"),
+    ("options", "message"),
     [
-        (with_another_neighbour, {"directions": {"axis": "vertex"}}, "/Sheet_axis: is Sphere in the source, must be free for"),
-        (with_another_child, {"coloured": "a"}, "/Sheet/DisplayColour: is Scope in the source, must be free for a Material"),
-        (None, {"output": "a.usda"}, "a file of the source's stage; it must be another file"),
-        (None, {"mesh": Mesh.grid(3, 3)}, "a.usda, prim /Sheet: has 6 vertices, must have as many as the mesh, 9"),
-        (None, {"primvars": {"displayColor": "vertex"}, "coloured": "displayColor"}, "'displayColor' has a meaning already"),
-        (None, {"primvars": {"a": "faceVarying"}}, "primvars.'a'. is 'faceVarying'; it must be 'vertex' or 'uniform'"),
-        (None, {"coloured": "b"}, "coloured is 'b'; it must be one of 'a', or None"),
-        (None, {"directions": {"axis 1": "vertex"}}, "directions: 'axis 1' must be a name such as principal1"),
-        (None, {"directions": {"axis": "face"}}, "directions.'axis'. is 'face'; it must be 'vertex' or 'uniform'"),
-        (None, {"directions": {"axis": "uniform"}, "mesh": Mesh.chain(3)}, "is 'uniform'; it must be 'vertex'"),
-        (None, {"chunk": 0}, "chunk is 0; it must be a whole number"),
-        (None, {"fps": np.nan}, "fps is nan; it must be positive and finite"),
-        (None, {"up_axis": "X"}, "up_axis is 'X'"),
-        (None, {"metadata": {"legend": {"low": None}}}, r"metadata\['legend'\]\['low'\] is None; it must be a number, a text"),
-        (None, {"metadata": {"levels": [1, 2]}}, r"metadata\['levels'\] is \[1, 2\]; it must be a number, a text"),
+        ({"directions": {"ball": "vertex"}}, "/Sheet_ball: is Sphere in the source, must be free for"),
+        ({"coloured": "a"}, "/Sheet/DisplayColour: is Scope in the source, must be free for a Material"),
+        ({"output": "a.usda"}, "a file of the source's stage; it must be another file"),
+        ({"mesh": Mesh.grid(3, 3)}, "a.usda, prim /Sheet: has 6 vertices, must have as many as the mesh, 9"),
+        ({"primvars": {"displayColor": "vertex"}, "coloured": "displayColor"}, "'displayColor' has a meaning already"),
+        ({"primvars": {"a": "faceVarying"}}, "primvars.'a'. is 'faceVarying'; it must be 'vertex' or 'uniform'"),
+        ({"coloured": "b"}, "coloured is 'b'; it must be one of 'a', or None"),
+        ({"directions": {"axis 1": "vertex"}}, "directions: 'axis 1' must be a name such as principal1"),
+        ({"directions": {"axis": "face"}}, "directions.'axis'. is 'face'; it must be 'vertex' or 'uniform'"),
+        ({"directions": {"axis": "uniform"}, "mesh": Mesh.chain(3)}, "is 'uniform'; it must be 'vertex'"),
+        ({"chunk": 0}, "chunk is 0; it must be a whole number"),
+        ({"fps": np.nan}, "fps is nan; it must be positive and finite"),
+        ({"up_axis": "X"}, "up_axis is 'X'"),
+        ({"metadata": {"legend": {"low": None}}}, r"metadata\['legend'\]\['low'\] is None; it must be a number, a text"),
+        ({"metadata": {"levels": [1, 2]}}, r"metadata\['levels'\] is \[1, 2\]; it must be a number, a text"),
+        ({"source": "instanced.usda"}, "is part of an instance"),
+        ({"output": "nowhere/out.usdc", "source": None}, "nowhere does not exist"),
     ],
 )
-def test_bad_options_are_refused(tmp_path, monkeypatch, change, options, message):
+def test_bad_options_are_refused(tmp_path, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
-    stage, mesh = define_mesh("a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
-    if change:
-        change(stage, mesh)
+    stage, _ = define_mesh("a.usda", PENTAGON, *PENTAGON_AND_TRIANGLE)
+    UsdGeom.Sphere.Define(stage, "/Sheet_ball")
+    if options == {"coloured": "a"}:
+        UsdGeom.Scope.Define(stage, "/Sheet/DisplayColour")
     stage.Save()
-    source = read_stage_mesh("a.usda")
-    with pytest.raises(ValueError, match=message):
-        MeasureWriter(**{"output": "out.usda", "mesh": source.mesh, "primvars": {"a": "vertex"}, "source": source, **options})
-    assert os.listdir() == ["a.usda"]
-
-
-def test_instances_and_missing_folders_are_refused(tmp_path):
-    artist_stage(tmp_path / "artist.usda")
-    instanced = tmp_path / "instanced.usda"
-    instanced.write_text('#usda 1.0\ndef Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n')
-    source = read_stage_mesh(instanced)
-    with pytest.raises(ValueError, match="is part of an instance"):
-        MeasureWriter(tmp_path / "out.usdc", source.mesh, {}, source=source)
-    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
-        MeasureWriter(tmp_path / "nowhere" / "out.usdc", source.mesh, {})
+    artist_stage("artist.usda")
+    instance = 'def Xform "Copy" (\n    instanceable = true\n    references = @./artist.usda@\n)\n{\n}\n'
+    Path("instanced.usda").write_text(f"#usda 1.0\n{instance}")
+    source = read_stage_mesh(options.get("source") or "a.usda")
+    given = {"output": "out.usda", "mesh": source.mesh, "primvars": {"a": "vertex"}, "source": source} | options
+    given["source"] = given["source"] and source
+    with pytest.raises(FileNotFoundError if "exist" in message else ValueError, match=message):
+        MeasureWriter(**given)
+    assert sorted(os.listdir()) == ["a.usda", "artist.usda", "instanced.usda"]
 
 
 GOOD = np.arange(9.0)
@@ -503,18 +467,9 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step):
     """As for animations: an earlier result, or the new one as far as it got. Here samples of three prims."""
     source, output = over_artist(tmp_path), tmp_path / "out.usdc"
     measure(output, source.mesh, source, sign=-1.0, single_file=True)
-    steps, real = iter(range(100)), os.replace
-
-    def replace_until_full(*paths):
-        if next(steps) >= step:
-            raise OSError("no space left on device")
-        real(*paths)
-
-    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace_until_full)
-    try:
+    full_from(step, monkeypatch, once=False)
+    with suppress(OSError):
         measure(output, source.mesh, source, single_file=True)
-    except OSError:
-        pass
     now = FrameSequence(output, attribute="primvars:stretch1")
     # Renames: the rest, the manifest, then of each of three chunks the frames and the root; two more for one file.
     earlier = step <= 3
@@ -525,69 +480,10 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step):
     assert len(stage.GetPrimAtPath(f"{prim.GetPath()}_corner").GetAttribute("points").GetTimeSamples()) == len(now)
 
 
-IMPORTS = """
-import itertools, sys
-sys.path[:0] = {path!r}
-from support.stages import measure
-from warpcloth.usd import read_stage_mesh
-"""
-VICTIM = """
-source = read_stage_mesh(given[1])
-print("ready", flush=True)
-for run in itertools.count():
-    measure(given[0], source.mesh, source, sign=(-1) ** run)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_killed_writer_leaves_a_readable_result(tmp_path):
-    mesh = Mesh.grid(40, 40)
-    path = artist_stage(tmp_path / "artist.usda", mesh)
-    moments, output = random.Random(1), tmp_path / "out.usdc"
-    measure(output, read_mesh(path), read_stage_mesh(path))
-    with Forks(IMPORTS.format(path=[str(Path(__file__).parents[1]), *sys.path])) as forks:
-        for trial in range(3):
-            said, ends = tmp_path / f"{trial}.txt", time.monotonic() + 60.0
-            victim = forks.start(VICTIM, said, str(output), path)
-            while not (said.exists() and said.read_text()) and time.monotonic() < ends:
-                time.sleep(0.001)
-            time.sleep(moments.uniform(0, 0.5))
-            os.kill(victim, signal.SIGKILL)
-            assert forks.wait() == -signal.SIGKILL and said.read_text() == "ready\n"
-            now = FrameSequence(output, attribute="primvars:stretch1")
-            sign = np.sign(now[0][5])
-            for frame, values in enumerate(now):
-                np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
-            assert len(now) in (3, 6, 7) and validate(output, path) == []
-
-
 def test_a_layer_for_which_the_disk_has_no_room_is_named(tmp_path):
     path, layer = tmp_path / "a.usdc", Sdf.Layer.CreateAnonymous(".usdc")
     Sdf.AttributeSpec(Sdf.CreatePrimInLayer(layer, "/A"), "x", Sdf.ValueTypeNames.FloatArray)
     layer.GetAttributeAtPath("/A.x").default = Vt.FloatArray.FromNumpy(np.random.default_rng(0).random(100_000, np.float32))
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
-            export(layer, path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with room_for(10_000), pytest.raises(OSError, match=re.escape(f"{path}: could not be written")) as raised:
+        export(layer, path)
     assert "pxrInternal" not in str(raised.value) and not path.exists()
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")
-def test_memory_stays_flat(tmp_path):
-    mesh = Mesh.grid(80, 80)
-    values = np.arange(len(mesh.triangles), dtype=np.float32)
-    colours = np.zeros((len(values), 3), np.float32)
-    writer = MeasureWriter(tmp_path / "a.usdc", mesh, {"a": "uniform"}, "a")
-    for frame in range(300):
-        if frame == 50:
-            before = anonymous_memory()
-        writer.append(frame, {"a": values + frame}, colours + np.float32(1e-3 * frame), points=mesh.points + 1e-3 * frame)
-    writing = anonymous_memory() - before
-    writer.close(single_file=True)
-    # As of an animation: a chunk of 10, its copy and what malloc keeps stay below 40 of the 250 frames.
-    frame_bytes = values.nbytes + colours.nbytes + mesh.points.nbytes  # points and normals, in float32
-    assert max(writing, anonymous_memory() - before) < 40 * frame_bytes

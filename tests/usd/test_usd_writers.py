@@ -25,6 +25,9 @@ from support.stages import (
     animated_prim,
     anonymous_memory,
     artist_stage,
+    full_from,
+    measure,
+    measured,
     motion,
     write,
 )
@@ -32,31 +35,39 @@ from support.usd_validation import validate
 from warpcloth.analysis.analysis import Analyzer
 from warpcloth.cli.reports import ReportFiles, write_report
 from warpcloth.mesh.mesh import Mesh
-from warpcloth.usd import AnimationWriter, FrameSequence, chunks, read_mesh, read_stage_mesh
+from warpcloth.usd import AnimationWriter, FrameSequence, MeasureWriter, chunks, read_mesh, read_stage_mesh
 
 EPS = np.finfo(np.float32).eps
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="counts memory as Linux does")
-@pytest.mark.parametrize("ending", slow_but(["usdc"], ["usdc", "usdz"]))
-def test_memory_stays_flat(tmp_path, ending):
+@pytest.mark.parametrize("kind", slow_but(["usdc", "measures"], ["usdc", "usdz", "measures"]))
+def test_memory_stays_flat(tmp_path, kind):
     mesh = Mesh.grid(100, 100)
     points, velocities = (values.astype(np.float32) for values in motion(mesh, 0))
-    frame_bytes = 3 * points.nbytes
-    writer = AnimationWriter(tmp_path / f"a.{ending}", mesh, 24)
-    for frame in range(500):
+    values = np.arange(len(mesh.triangles), dtype=np.float32)
+    colours = np.zeros((len(values), 3), np.float32)
+    if kind == "measures":
+        writer, count = MeasureWriter(tmp_path / "a.usdc", mesh, {"a": "uniform"}, "a"), 300
+        frame_bytes = values.nbytes + colours.nbytes + 2 * points.nbytes  # normals too
+    else:
+        writer, count, frame_bytes = AnimationWriter(tmp_path / f"a.{kind}", mesh, 24), 500, 3 * points.nbytes
+    for frame in range(count):
         if frame == 50:
             before = anonymous_memory()
-        writer.append(points + np.float32(1e-3 * frame), velocities)
-    writing = anonymous_memory() - before
+        moved = points + np.float32(1e-3 * frame)
+        if kind == "measures":
+            writer.append(frame, {"a": values + frame}, colours + np.float32(1e-3 * frame), points=moved)
+        else:
+            writer.append(moved, velocities)
+    grown = [anonymous_memory() - before]
     writer.close(single_file=True)
-    closing = anonymous_memory() - before
-    for values in FrameSequence(writer.path):
-        assert values[0, 0] >= 0
-    reading = anonymous_memory() - before
+    grown.append(anonymous_memory() - before)
+    for found in FrameSequence(writer.path):
+        assert found[0, 0] >= 0
+    grown.append(anonymous_memory() - before)
     # Kept frames would be 450 · 360 kB = 154 MiB. A chunk of 10, its copy and what malloc keeps stay below 40 frames.
-    for grown in (writing, closing, reading):
-        assert grown < 40 * frame_bytes, (writing, closing, reading)
+    assert max(grown) < 40 * frame_bytes, grown
 
 
 @pytest.mark.parametrize("single_file", [False, True], ids=["chunks", "one"])
@@ -65,15 +76,7 @@ def test_every_rename_may_be_the_last(tmp_path, monkeypatch, step, single_file):
     """A disk that is full at any of the steps leaves the earlier result, or the new one as far as it got."""
     mesh, output = Mesh.grid(5, 4), tmp_path / "out.usdc"
     write(output, mesh, frames=30, sign=-1.0)
-    steps = iter(range(100))
-    replace = os.replace
-
-    def replace_until_full(*paths):
-        if next(steps) == step:
-            raise OSError("no space left on device")
-        replace(*paths)
-
-    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace_until_full)
+    full_from(step, monkeypatch)
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
     appended = 0
     try:
@@ -114,7 +117,7 @@ def test_a_reader_finds_a_whole_file_at_any_moment(tmp_path, monkeypatch, ending
         look()
 
     writer = AnimationWriter(output, mesh, 24, chunk=CHUNK)
-    monkeypatch.setattr("warpcloth.usd.chunks.os.replace", replace)
+    monkeypatch.setattr(os, "replace", replace)
     for frame in range(FRAMES):
         writer.append(*motion(mesh, frame))
     writer.close(single_file=single_file)
@@ -210,23 +213,14 @@ def test_a_folder_without_locks_warns(tmp_path, monkeypatch):
     assert len(FrameSequence(tmp_path / "out.usdc")) == FRAMES
 
 
-def spoil(folder, act):
-    """Changes a source, or the files of an output, during a run."""
-    stage, output = folder / "artist.usda", folder / "out.usdc"
-    if act == "delete":
-        stage.unlink()
-    elif act == "garble":
-        stage.write_text("garbage")
-    elif act == "triangles":
-        artist_stage(stage, Mesh.grid(3, 3))
-    elif act == "touch":
-        stage.write_text(stage.read_text() + "# said later\n")
-    elif act == "frames":
-        shutil.rmtree(folder / "out_frames")
-    elif act == "folder":
-        if output.exists():
-            output.unlink()
-        output.mkdir()
+SPOIL = {  # what changes a source, or the files of an output in a folder, during a run
+    "delete": lambda folder: (folder / "artist.usda").unlink(),
+    "garble": lambda folder: (folder / "artist.usda").write_text("garbage"),
+    "triangles": lambda folder: artist_stage(folder / "artist.usda", Mesh.grid(3, 3)),
+    "touch": lambda folder: (folder / "artist.usda").write_text((folder / "artist.usda").read_text() + "# said later\n"),
+    "frames": lambda folder: shutil.rmtree(folder / "out_frames"),
+    "folder": lambda folder: ((folder / "out.usdc").unlink(missing_ok=True), (folder / "out.usdc").mkdir()),
+}
 
 
 @pytest.mark.parametrize(
@@ -251,7 +245,7 @@ def test_what_changes_during_a_run_is_noticed(tmp_path, act, ending, single_file
             for frame in range(FRAMES):
                 writer.append(*motion(mesh, frame))
                 if frame == CHUNK:
-                    spoil(tmp_path, act)
+                    SPOIL[act](tmp_path)
         finally:
             writer.close(single_file=single_file)
     assert "\n" not in str(caught.value) and writer.kept == kept
@@ -282,7 +276,8 @@ def test_a_source_that_changes_and_fits_is_said(tmp_path, ending):
     ):
         for frame in range(FRAMES):
             writer.append(*motion(mesh, frame))
-            spoil(tmp_path, "touch" if frame == CHUNK else None)
+            if frame == CHUNK:
+                SPOIL["touch"](tmp_path)
     assert len(FrameSequence(tmp_path / f"out.{ending}")) == FRAMES
 
 
@@ -383,9 +378,8 @@ def interrupt_twice(now):
 IMPORTS = """
 import itertools, os, sys
 sys.path[:0] = {path!r}
-from support.stages import CHUNK, FRAMES, Mesh, motion
-from warpcloth.usd import read_mesh
-from warpcloth.usd import AnimationWriter
+from support.stages import CHUNK, FRAMES, Mesh, measure, motion
+from warpcloth.usd import AnimationWriter, read_mesh, read_stage_mesh
 """
 VICTIM = """
 output, source, single_file, log = given
@@ -398,6 +392,14 @@ for run in itertools.count():
             os.write(log, b".")
         writer.close(single_file=bool(single_file))
         os.write(log, b"|")
+"""
+
+
+MEASURER = """
+source = read_stage_mesh(given[1])
+print("ready", flush=True)
+for run in itertools.count():
+    measure(given[0], source.mesh, source, sign=(-1) ** run)
 """
 
 
@@ -442,15 +444,29 @@ def test_a_killed_writer_loses_one_chunk_at_most(tmp_path, forks, ending, with_s
         assert not list(tmp_path.glob(".*.lock"))
 
 
-def check_survivor(output, mesh, log, source):
-    """The result of the run before is left, or frames of the last run, without its last chunk at most.
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_killed_writer_of_measures_leaves_a_readable_result(tmp_path, forks):
+    mesh, moments, output = Mesh.grid(40, 40), random.Random(1), tmp_path / "out.usdc"
+    path = artist_stage(tmp_path / "artist.usda", mesh)
+    measure(output, read_mesh(path), read_stage_mesh(path))
+    for trial in range(3):
+        said, ends = tmp_path / f"{trial}.txt", time.monotonic() + 60.0
+        victim = forks.start(MEASURER, said, str(output), path)
+        while not (said.exists() and said.read_text()) and time.monotonic() < ends:
+            time.sleep(0.001)
+        time.sleep(moments.uniform(0, 0.5))
+        os.kill(victim, signal.SIGKILL)
+        assert forks.wait() == -signal.SIGKILL and said.read_text() == "ready\n"
+        now = FrameSequence(output, attribute="primvars:stretch1")
+        sign = np.sign(now[0][5])
+        for frame, values in enumerate(now):
+            np.testing.assert_array_equal(values, np.float32(measured(mesh, frame, sign)[0]["stretch1"]))
+        assert len(now) in (3, 6, 7) and validate(output, path) == []
 
-    Args:
-        output: The output.
-        mesh: Its mesh.
-        log: A point for each append that had returned, a bar for each close.
-        source: The artist's stage, or "".
-    """
+
+def check_survivor(output, mesh, log, source):
+    """The result before is left, or the last run but for its last chunk at most; the log has . for an append, | for a close."""
     runs = log.split("|")
     appended = len(runs[-1])
     last = (-1) ** (len(runs) - 1)
